@@ -8,15 +8,14 @@ from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CLUMP, COMPOUND
 from dem.compiled import inlined, loop
 from dem.exchange import reduced
-from dem.scene import least_half
 from dem.step import Step
 
 
-def overlaps(step: Step) -> tuple[float, float]:
+def overlaps(step: Step, large: Floats) -> tuple[float, float]:
     """The greatest overlap at the start of a step, and the greatest that the springs of contacts leave at its end under
-    the forces of the step, as parts of half thicknesses; of two large bodies those of the thinner; collective."""
+    the forces of the step, as parts of half thicknesses; of two large bodies those of the thinner, with the half
+    thicknesses `large` (large bodies,) [m]; collective."""
     contacts, system, near = step.contacts, step.system, step.contacts.near
-    large = np.array([least_half(body) for body in step.world.large_bodies], float)
     given = contacts.gap, contacts.linear_gap, step.in_cone, system.stiffness, system.compliance[:, 0], system.dt
     first = near.grains + near.ghosts
     found = deepest(*given, contacts.a, contacts.b, near.bodies.shape, near.bodies.size, large, first)

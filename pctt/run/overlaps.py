@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from dem.overlaps import overlaps
-from dem.scene import Scene
+from dem.scene import Scene, least_half
 from dem.step import Step
 from dem.stiffness import OVERLAP, expected_overlap
 from dem.time_step import DRIVEN, smallest
@@ -31,6 +33,7 @@ class OverlapWatch:
 
     def __init__(self, scene: Scene, settings: Settings, stiffness: float) -> None:
         self.springs = expected_overlap(scene, stiffness, settings.dt)
+        self._large = np.array([least_half(body) for body in scene.large_bodies], float)
         self._size, self._dt = smallest(scene), settings.dt
         closing = settings.limits.closing_speed
         closes = closing * settings.dt if math.isfinite(closing) else CLOSING * settings.delta
@@ -43,7 +46,7 @@ class OverlapWatch:
     def look(self, step: Step, closing_speed: float) -> str:
         """The field of `Settings` that helps, if a step shows more than TWICE of what is promised (and of OVERLAP, what
         scenes have by default) and it was not told yet; the same on all ranks; collective."""
-        found, held = overlaps(step)
+        found, held = overlaps(step, self._large)
         if self._start is None:
             self._start = found
         least, springs = 0.5 * found, max(held, self._held)

@@ -218,9 +218,10 @@ def test_ids_materials_mass_and_inertia():
 def test_large_bodies_that_overlap_at_the_start_are_refused():
     """By more than 1 % of a half thickness; not those of a joint, of prescribed motions, or that no force can part."""
 
-    def start(motion=Dynamic(), place=(0.0, 0.0, 0.06), other=(0.9, 0.0, 1.0), joint=False):
+    def start(motion=None, place=(0.0, 0.0, 0.06), other=(0.9, 0.0, 1.0), joint=False):
         scene = Scene(0.3)
         scene.add_body("floor", [Plane((0, 0, 1))])
+        motion = motion or Dynamic()
         given = {"density": 500.0} if isinstance(motion, Dynamic) else {}
         scene.add_body("bar", [Box((0.5, 0.05, 0.05))], motion, position=place, **given)
         scene.add_body("other", [Box((0.5, 0.05, 0.05))], Dynamic(), position=other, density=500.0)

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
 import pctt
 from dem.motion import Dynamic, Guided
@@ -138,6 +139,11 @@ def told(**settings) -> list[str]:
     return [str(warning.message) for warning in caught if "overlap" in str(warning.message)]
 
 
+@pytest.mark.parallel(2)
+def test_the_ranks_tell_it_together():
+    assert len(told()) == (MPI.COMM_WORLD.rank == 0)
+
+
 def test_a_spring_that_bears_more_than_promised_is_told_once_in_the_language_of_the_door():
     for program, name in ((False, "a larger stiffness="), (True, "a larger -stiffness")):
         (words,) = told(program=program)
@@ -155,6 +161,6 @@ def test_what_makes_an_overlap(held, loose, cause, monkeypatch):
     with pctt.Simulation(scene) as sim:
         watch, dt = sim.overlap_watch, sim.settings.dt
     seen = iter([(0.0, held), (0.06, 0.0), (0.001, 0.0)])
-    monkeypatch.setattr("pctt.run.overlaps.overlaps", lambda step: next(seen))
+    monkeypatch.setattr("pctt.run.overlaps.overlaps", lambda *step: next(seen))
     assert [watch.look(None, loose * 0.1 / dt) for _ in range(3)] == ["", cause, ""]
     assert watch.cause == cause
