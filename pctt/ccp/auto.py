@@ -8,8 +8,6 @@ one that is easy costs nothing more.
 For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path. Problems
 of few contacts are the exception: there it goes on to the end.
-
-With joints, which the sparse systems of the conic method do not have, it is APGD alone.
 """
 
 from __future__ import annotations
@@ -59,10 +57,8 @@ def solve(
         tried.append(result)
         return result
 
-    alone = problem.contact_map is not None and not problem.contact_map.has_rows  # apgd takes it alone
-    few = not alone and newton.has_few(problem)
-    most = limits.max_it if alone else options.iterations(problem.size, limits.tol, coulomb, few)
-    begun = min(limits.max_it, problem.comm.bcast(most))
+    few = newton.has_few(problem)
+    begun = min(limits.max_it, problem.comm.bcast(options.iterations(problem.size, limits.tol, coulomb, few)))
     last = first = attempt(apgd, guess, replace(limits, max_it=begun), apgd.APGD())
     if not first.final and begun < limits.max_it:
         inner, settings, begin = replace(limits, max_it=min(60, limits.max_it)), conic.Conic(), guess
