@@ -25,7 +25,7 @@ from dem import bodies
 from dem.exchange import exchange
 from dem.experiment import Experiment
 from dem.motion import Dynamic
-from dem.period import velocity_in_cell, wrapped
+from dem.period import lattice, velocity_in_cell, wrapped
 from dem.polyhedra import triangles
 from dem.scene import least_half
 from dem.shapes import described
@@ -203,7 +203,7 @@ class Writer:
             **_by_id(world, (*PLACES, *(TABLE if world.tallies else ()))),
             "contact/key": contacts.key,
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
-            "contact/point": wrapped(contacts.point, world.period, world.shear),
+            "contact/point": step.point,
             "contact/frame": step.system.frame,
             "contact/moved": np.zeros_like(contacts.point) if contacts.moved is None else contacts.moved,
             "contact/gap": contacts.gap,
@@ -211,7 +211,11 @@ class Writer:
         }
         if (moments := step.moments) is not None:
             rows["contact/moment"] = moments
-        about = {"/": {"step": world.step, "time": world.time}, "record": row, "contact": {"dt": step.system.dt}}
+        top: dict[str, Any] = {"step": world.step, "time": world.time}
+        if world.period is not None:
+            top["lattice"], top["drift"] = lattice(world.period, world.shear)
+            top["rate"] = np.zeros(3) if world.servo is None else world.servo.rate
+        about = {"/": top, "record": row, "contact": {"dt": step.system.dt}}
         write_rows(frames / f"{world.step:06d}.h5", self.comm, rows, {}, about)
         self._recorded = world.step
 
