@@ -159,8 +159,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
 
     Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be, but hold
-    no more than impulses have loaded them with (`dem.stiffness.spring_energies`). What they lose or gain between two steps
-    is in no term: the spring energy of a step less that before the next.
+    no more than impulses have loaded them with (`dem.stiffness.spring_energies`). What they lose or gain between two
+    steps is in no term: the spring energy of a step less that before the next.
 
     The jump is the rise of the kinetic energy in a step in which it rises by more than the work of motions, gravity
     and springs allows, or to more than ten times what there was, although gravity and drives do not give that; else 0.
