@@ -191,13 +191,15 @@ class Writer:
             return
         if self._recorded == self._start:
             self.place.make("frames")
-            rows = _by_id(world, TABLE[1:])
-            large = np.bytes_(json.dumps(described_bodies(world)))
-            shared = {"materials": texts(world.materials), "large": large}
-            for name, shapes in described_forms(world).items():
-                if shapes:
-                    shared[name] = np.bytes_(json.dumps(shapes))
-            write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
+            table = frames / "bodies.h5"
+            if not on_first(self.comm, table, lambda: self.place.goes_on and table.exists()):  # of the first frame
+                rows = _by_id(world, TABLE[1:])
+                large = np.bytes_(json.dumps(described_bodies(world)))
+                shared = {"materials": texts(world.materials), "large": large}
+                for name, shapes in described_forms(world).items():
+                    if shapes:
+                        shared[name] = np.bytes_(json.dumps(shapes))
+                write_rows(table, self.comm, rows, shared, {})
         near = contacts.near.bodies
         rows = {
             **_by_id(world, (*PLACES, *(TABLE if world.tallies else ()))),
