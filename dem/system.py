@@ -60,7 +60,8 @@ class ContactSystem:
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
         spring; 0: rigid [1/kg]
-        held (nc, 2): what tangential springs hold at the start of the step, from `take_hold` [N s]
+        last (nc,), held (nc, 2): the normal impulses of the last step, and what tangential springs hold at the start of
+        this one, from `take_hold` [N s]
         cell: its part in the step, a `dem.contact_map.cell.Cell`; None where its size is constant
         drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
         last step, in a cell that deforms [m/s]
@@ -122,7 +123,7 @@ class ContactSystem:
         self.free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
         self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
-        self.held = np.zeros((len(contacts), 2))
+        self.last, self.held = np.zeros(len(contacts)), np.zeros((len(contacts), 2))
         self.surface = surface_velocities(world, contacts, self.frame)
         if self.surface is not None:
             self.b[:, 1:] = self.surface
@@ -171,21 +172,28 @@ class ContactSystem:
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 
-    def take_hold(self, held: Floats) -> None:
-        """Let tangential springs begin with what they held at the end of the last step (nc, 2), in the frames of this
-        one [N s]."""
-        self.held = held
-        stiffness.pull_back(self.r, self.compliance, held)
+    def take_hold(self, last: Floats) -> None:
+        """Let springs begin with what they held at the end of the last step (nc, 3), as `held_after` gave it, in the
+        frames of this one [N s]."""
+        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
+        stiffness.pull_back(self.r, self.compliance, self.held)
 
     def held_after(self, impulse: Floats) -> Floats:
         """Impulses of the step (parts nc, 3), see `dem.pairs.Pairs.parts`, with what tangential springs hold at its end
         in the place of the tangential ones [N s]."""
         return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
 
-    def spring_energies(self, gap: Floats, after: Floats, impulse: Floats) -> tuple[float, float, float, float]:
-        """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3)."""
-        given = self.stiffness, self.compliance, self.dt
-        return stiffness.spring_energies(*given, gap, after, self.held, impulse)
+    def spring_energies(
+        self, contacts: Contacts, before: Floats, opening: Floats, impulse: Floats
+    ) -> tuple[float, float, float, float]:
+        """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3) in the friction cones, and the normal
+        velocities `opening` (nc,) of its end; `before` (rows, 6) are the velocities before it."""
+        came = self.contact_map.relative_velocities(before)[:, 0]
+        if self.drift is not None:
+            came = came + self.drift[:, 0]
+        gaps = contacts.gap - self.dt * came, contacts.gap, contacts.linear_gap + self.dt * opening
+        held = self.last, self.held, impulse
+        return stiffness.spring_energies(self.stiffness, self.compliance, self.dt, *gaps, *held)
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""

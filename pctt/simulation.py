@@ -300,7 +300,7 @@ class Simulation:
             "contacts",
             key=own.key,
             bodies=np.searchsorted(np.append(self.ids, self.world.large.id), np.stack([id[own.a], id[own.b]], axis=1)),
-            point=wrapped(own.point, self.world.period, self.world.shear),
+            point=step.point,
             frame=step.system.frame,
             gap=own.gap,
             moved=np.zeros_like(own.point) if own.moved is None else own.moved,

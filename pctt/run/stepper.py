@@ -175,7 +175,7 @@ class Stepper:
             place = self.system.key, self.system.frame
             last, _ = self.memory.recall(*place, self._slabs is not self.world.slabs)
             guess = last if found is None else found.recall(*place, elsewhere=False)[0]
-            self.system.take_hold(last[: len(contacts), 1:])
+            self.system.take_hold(last[: len(contacts)])
             self._problem = cone_problem(self.system, self.world.comm)
         return self._problem, guess
 
