@@ -112,6 +112,7 @@ class Result:
     accuracy : the figures of the impulses; set by `pctt.ccp.solve`
     momentum : (6m,) G' g, or g where the problem is given by N; set by `pctt.ccp.solve`
     asked : what the asked method made of it, where another one had to follow; else None
+    exhausted : whether it has tried the other methods, too
     """
 
     impulse: Array
@@ -129,6 +130,7 @@ class Result:
     accuracy: Accuracy | None = None
     momentum: Array = field(default_factory=lambda: np.zeros(0))
     asked: Result | None = None
+    exhausted: bool = False
 
     @property
     def converged(self) -> bool:
