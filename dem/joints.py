@@ -4,7 +4,7 @@ A joint has rows J of the velocities of its two bodies. In a step with the free 
 
     v = v* + M^-1 J' g,    J v + e (g - f) = t,
 
-with t = -error / dt for what the joint holds, so that its error is gone at the end of the step, to second order in dt.
+with t for what the joint holds such that its error is gone at the end of the step, see `coupling`.
 Motors have t = their speed. Their e is 0 if nothing bounds them. A bounded one gives the impulse f which brings it to
 its speed without contacts, within its strength, and e as `dem.motion.Driven` has its grip. Contacts see the joints in
 their inverse mass (`dem.contact_map.jointed`), so joints and contacts are solved together. Which limits are reached and
@@ -37,7 +37,7 @@ HOLDS = {
     "fixed": (True,) * 6,
 }
 
-ROUNDS = 8  #: of the iteration for the angular momentum of jointed bodies, at most
+ROUNDS = 8  #: of the iteration for what is not linear in the velocities, at most
 
 HELD, MOTOR, LOWER, UPPER = range(4)  #: kinds of rows: what a joint holds, its motor, its limits
 
@@ -179,12 +179,14 @@ class Coupling:
 def coupling(
     joints: Sequence[Joint], row: Ints, ends: Ends, dt: float, period: Floats | None, push: Floats
 ) -> Coupling:
-    """Of joints between bodies in the rows `row` (n, 2) in a step of dt [s], with the period of the cell, where contacts
-    are expected to give the bodies the mass-scaled momenta `push` (n, 6).
+    """Of joints between bodies in the rows `row` (n, 2) in a step of dt [s], with the period of the cell, where
+    contacts are expected to give the bodies the mass-scaled momenta `push` (n, 6).
 
-    Motors that are too weak, and limits that are reached, are found without contacts, by an active set. Angular momentum
-    is not linear in the spin of bodies that are no spheres: what joints do to it is found by a fixed-point iteration,
-    whose error falls by about the angle of a step each time."""
+    Motors that are too weak, and limits that are reached, are found without contacts, by an active set. What is not
+    linear is found by a fixed-point iteration, whose error falls by about the angle of a step each time: the angular
+    momentum of bodies that are no spheres, and the errors of joints at the end of the step. So joints hold there, as
+    in the method SHAKE, with forces of the start of the step, and energy does not drift (Hairer, Lubich, Wanner,
+    "Geometric Numerical Integration", section VII.1.4)."""
     found = geometry(joints, row, ends, period)
     count = len(ends.free)
     chosen: list[tuple[int, int]] = []
@@ -226,7 +228,7 @@ def coupling(
     known = ends.quaternion[rows], ends.velocity[rows, 3:], ends.moments[rows]
     spin, middle = np.full((2, count, 3), np.nan)
     held, left = kind == HELD, t.copy()
-    expected = push.ravel()
+    expected, pushed = push.ravel(), B @ push.ravel()
     for _ in range(ROUNDS):
         change = np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
         alone, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.given[rows])
@@ -238,9 +240,10 @@ def coupling(
             if not wrong.any():
                 break
             on, given = _turned(kind, bound, on, given, g, wrong)
-        last = expected
-        expected = push.ravel() + B.T @ _impulses(A, t, free + B @ push.ravel(), on, given)
-        if np.abs(expected - last).max() <= 1e-9 * np.abs(expected).max():
+        last, expected = expected, B.T @ g
+        if pushed.any():
+            expected = push.ravel() + B.T @ _impulses(A, t, free + pushed, on, given)
+        if np.abs(expected - last).max() <= 1e-7 * np.abs(expected).max():
             break
         after = velocity + np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
         place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after[:, 3:], dt)

@@ -23,7 +23,8 @@ class Survey:
     """Of some grains."""
 
     count: int
-    extremes: Bodies  #: the smallest and largest, the heaviest over its radius and over its square, and the fastest
+    #: the smallest and largest, the heaviest over its radius and over its square, and those that go and turn fastest
+    extremes: Bodies
     mass: float  #: sum [kg]
     radius: float  #: sum of the radii of the spheres about them [m]
     centre: Floats  #: (3,) mean of the positions [m]
@@ -56,7 +57,7 @@ def _of(grains: Bodies, speed: Callable[[Bodies], Floats]) -> Survey:
 def _extremes(grains: Bodies, speed: Callable[[Bodies], Floats]) -> Bodies:
     radius = bodies.bounding_radius(grains)
     with np.errstate(over="ignore", divide="ignore"):
-        tests = (-radius, radius, grains.mass / radius, grains.mass / radius**2, speed(grains))
+        tests = (-radius, radius, grains.mass / radius, grains.mass / radius**2, speed(grains), bodies.turning(grains))
     return grains.take(np.array([np.argmax(values) for values in tests]))
 
 

@@ -42,6 +42,7 @@ from dem.start import step_remark
 from dem.step import Step
 from dem.stiffness import expected_overlap
 from dem.together import meet, together
+from dem.turns import TurnWatch
 from dem.world import (
     set_load,
     set_motion,
@@ -124,6 +125,8 @@ class Simulation:
             self.memory = ImpulseMemory(comm, self.world.pairs.parts)
         if large := step_remark(self.world, self.settings.dt):
             warn(comm, large)
+        self._turns = TurnWatch()
+        self._tell_turns()
         self.restart = str(restart)  #: the file from which it goes on
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
@@ -175,7 +178,13 @@ class Simulation:
         self.figures = self._row | figures
         if figures["energy_jump"]:
             warn(self.comm, report.jump_words(self.figures))
+        self._tell_turns()
         return self.figures
+
+    def _tell_turns(self) -> None:
+        """Warn of a body that turns too far in a step; collective."""
+        if words := self._turns.look(self.world, self.settings.dt):
+            warn(self.comm, words)
 
     def run(
         self,
