@@ -247,8 +247,8 @@ class World:
 
 
 def turns_unlike_spheres(world: World) -> bool:
-    """Whether a body that forces move may be none that turns as a sphere does; the same on all ranks."""
-    return not world.only_spheres or bool(bodies.is_dynamic(world.large).any())
+    """Whether a body that turns freely may do so in another way than a sphere; the same on all ranks."""
+    return not world.only_spheres or bool(np.isfinite(world.large.inertia).all(axis=1).any())
 
 
 def set_motion(world: World, name: str, motion: Motion | None = None, **values: Any) -> None:
