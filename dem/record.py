@@ -158,9 +158,9 @@ def energy_balance(step: Step) -> dict[str, float]:
     what holds bodies in part, of belts, loads, springs and the shear of a cell. The rest is the error of the semi-
     implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
 
-    Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be. What they
-    lose or gain between two steps by the difference is in no term: the spring energy of a step less that before the
-    next.
+    Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be, but hold
+    no more than impulses have loaded them with (`dem.stiffness.spring_energies`). What they lose or gain between two
+    steps is in no term: the spring energy of a step less that before the next.
 
     The jump is the rise of the kinetic energy in a step in which it rises by more than the work of motions, gravity
     and springs allows, or to more than ten times what there was, although gravity and drives do not give that; else 0.
@@ -183,8 +183,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     mean = 0.5 * (velocity[first:] + world.large.velocity)
     speeds = [table.velocity for table in after]
     normal, tangential, opening = system.works(step.in_cone, velocity, speeds[0], speeds[1], step.moment)
-    gaps = step.contacts.gap, step.contacts.linear_gap + system.dt * opening
-    *springs, strained, strained_at_end = system.spring_energies(*gaps, step.impulse)
+    *springs, strained, strained_at_end = system.spring_energies(step.contacts, velocity, opening, step.in_cone)
     received = np.vdot(step.impulse_on_large[~moves], mean[~moves])
     loads = 0.0
     if system.applied is not None:

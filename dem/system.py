@@ -61,7 +61,8 @@ class ContactSystem:
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
         spring; 0: rigid [1/kg]
-        held (nc, 2): what tangential springs hold at the start of the step, from `take_hold` [N s]
+        last (nc,), held (nc, 2): the normal impulses of the last step, and what tangential springs hold at the start of
+        this one, from `take_hold` [N s]
         cell: its part in the step, a `dem.contact_map.cell.Cell`; None where its size is constant
         drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
         last step, in a cell that deforms [m/s]
@@ -72,6 +73,7 @@ class ContactSystem:
         contact_map: G, with the halo of the bodies; the rows of its tables are those of `near`
         problem_map: G of the cone problem: with the rows of turning, where contacts resist it
         free_velocity (owned, 6): velocities without contacts, but with their attraction
+        free_large (large, 6): the same of the large bodies, without attraction, on all ranks
         push (owned, 6): mass-scaled momenta that contacts are expected to give; None if all bodies turn as spheres do
         middle (owned, 3): the angular velocities about which those of the step are linear in the impulses, see
         `dem.free_motion.free_spin`, or None
@@ -137,10 +139,10 @@ class ContactSystem:
             coupling = self.joints.matrix
             self.contact_map = JointedMap(self.contact_map, here[own], slot[own], coupling)
         self.free_velocity = free[:owned]
-        self._free_large = free[near.grains + near.ghosts :]
+        self.free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
         self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
-        self.held = np.zeros((len(contacts), 2))
+        self.last, self.held = np.zeros(len(contacts)), np.zeros((len(contacts), 2))
         self.surface = surface_velocities(world, contacts, self.frame)
         if self.surface is not None:
             self.b[:, 1:] = self.surface
@@ -188,21 +190,28 @@ class ContactSystem:
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 
-    def take_hold(self, held: Floats) -> None:
-        """Let tangential springs begin with what they held at the end of the last step (nc, 2), in the frames of this
-        one [N s]."""
-        self.held = held
-        stiffness.pull_back(self.r, self.compliance, held)
+    def take_hold(self, last: Floats) -> None:
+        """Let springs begin with what they held at the end of the last step (nc, 3), as `held_after` gave it, in the
+        frames of this one [N s]."""
+        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
+        stiffness.pull_back(self.r, self.compliance, self.held)
 
     def held_after(self, impulse: Floats) -> Floats:
         """Impulses of the step (parts nc, 3), see `dem.pairs.Pairs.parts`, with what tangential springs hold at its end
         in the place of the tangential ones [N s]."""
         return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
 
-    def spring_energies(self, gap: Floats, after: Floats, impulse: Floats) -> tuple[float, float, float, float]:
-        """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3)."""
-        given = self.stiffness, self.compliance, self.dt
-        return stiffness.spring_energies(*given, gap, after, self.held, impulse)
+    def spring_energies(
+        self, contacts: Contacts, before: Floats, opening: Floats, impulse: Floats
+    ) -> tuple[float, float, float, float]:
+        """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3) in the friction cones, and the normal
+        velocities `opening` (nc,) of its end; `before` (rows, 6) are the velocities before it."""
+        came = self.contact_map.relative_velocities(before)[:, 0]
+        if self.drift is not None:
+            came = came + self.drift[:, 0]
+        gaps = contacts.gap - self.dt * came, contacts.gap, contacts.linear_gap + self.dt * opening
+        held = self.last, self.held, impulse
+        return stiffness.spring_energies(self.stiffness, self.compliance, self.dt, *gaps, *held)
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
@@ -283,7 +292,7 @@ class ContactSystem:
     def drive_impulse(self, large: Floats) -> Floats:
         """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities
         `large` (large, 6) after the step."""
-        line, slip = self.drives.line, self._free_large - large
+        line, slip = self.drives.line, self.free_large - large
         return self.drives.impulse + (self.drives.grip * np.einsum("bi,bi->b", line, slip))[:, None] * line
 
     def works(

@@ -7,9 +7,8 @@ one that is easy costs nothing more.
 
 For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path. Problems
-of few contacts are the exception: there it goes on to the end.
-
-With joints, which the sparse systems of the conic method do not have, it is APGD alone.
+of few contacts are the exception: there it goes on to the end. It also takes these to an aim beyond the limits, in a
+few more steps; with many contacts APGD goes on to it.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from pctt.ccp.cone import Array
+from pctt.ccp import gathered
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
 from pctt.ccp.newton import Newton
@@ -54,16 +54,21 @@ def solve(
 
     def attempt(method: ModuleType, guess: Array, limits: Limits, *more: Any) -> Result:
         result: Result = method.solve(problem, guess, limits, *more, coulomb=coulomb)
-        result.solver = "conic" if method is conic else "apgd"
-        result.newton_its = result.iterations if method is conic else 0
+        result.solver = "apgd" if method is apgd else "conic"
+        result.newton_its = 0 if method is apgd else result.iterations
         tried.append(result)
         return result
 
-    alone = problem.contact_map is not None and not problem.contact_map.has_rows  # apgd takes it alone
-    few = not alone and newton.has_few(problem)
-    most = limits.max_it if alone else options.iterations(problem.size, limits.tol, coulomb, few)
-    begun = min(limits.max_it, problem.comm.bcast(most))
-    last = first = attempt(apgd, guess, replace(limits, max_it=begun), apgd.APGD())
+    few = newton.has_few(problem)
+    begun = min(limits.max_it, problem.comm.bcast(options.iterations(problem.size, limits.tol, coulomb, few)))
+    last = first = attempt(apgd, guess, replace(limits, max_it=begun, spare=0), apgd.APGD())
+    if first.converged and first.residual > limits.aimed:
+        if few or gathered.takes(problem, newton):
+            attempt(conic if few else gathered, guess, limits, conic.Conic(), newton)
+        if min(result.residual for result in tried) > limits.aimed and limits.spare:
+            attempt(apgd, first.impulse, limits, apgd.APGD())
+        last = min(tried, key=lambda result: result.residual)
+        return last.after(*(result for result in tried if result is not last))
     if not first.final and begun < limits.max_it:
         inner, settings, begin = replace(limits, max_it=min(60, limits.max_it)), conic.Conic(), guess
         if not coulomb:
