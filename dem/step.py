@@ -132,15 +132,19 @@ class Step:
         return self.system.impulse_on_large(self.impulse, self.moment)
 
 
-def advance(world: World, velocity: Floats, dt: float) -> None:
-    """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; collective.
+def advance(world: World, velocity: Floats, dt: float, kept: Floats | None = None) -> None:
+    """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; `kept` (owned, 6) are those with
+    which they go into the next step, if they are others. Collective.
 
     x <- x + dt (v + E x), q <- exp(dt w) q, with the rate E of a cell that changes its size.
     Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
     large_velocity, start = world.large_velocity(velocity, dt), world.grains.position
+    large_kept = None if kept is None else world.large_velocity(kept, dt)
     _move(world.grains, velocity[: len(world.grains)], dt)
     _move(world.large, large_velocity, dt)
+    if kept is not None and large_kept is not None:
+        world.grains.velocity, world.large.velocity = kept[: len(world.grains)].copy(), large_kept
     if world.servo is not None:
         world.grains.position = world.grains.position + dt * world.servo.rate * start
     if world.springs:

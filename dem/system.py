@@ -43,11 +43,12 @@ from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
 from dem.contact_map.loops import closing, scale
 from dem.contact_map.map import packed
+from dem.free_motion import kept_spin
 from dem.joints import Coupling
 from dem.rolling import resistance
 from dem.servo import cell_of
 from dem.surface import surface_velocities
-from dem.world import World
+from dem.world import World, turns_unlike_spheres
 
 
 class ContactSystem:
@@ -73,6 +74,9 @@ class ContactSystem:
         problem_map: G of the cone problem: with the rows of turning, where contacts resist it
         free_velocity (owned, 6): velocities without contacts, but with their attraction
         free_large (large, 6): the same of the large bodies, without attraction, on all ranks
+        push (owned, 6): mass-scaled momenta that contacts are expected to give; None if all bodies turn as spheres do
+        middle (owned, 3): the angular velocities about which those of the step are linear in the impulses, see
+        `dem.free_motion.free_spin`, or None
         resistance: the rows of `dem.rolling`, or None
         attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.cohesion`
         drives: of the large bodies, the same on all ranks
@@ -82,10 +86,12 @@ class ContactSystem:
 
     def __init__(
         self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf,
-        joints: Coupling | None = None, spent: Ints | None = None,
+        joints: Coupling | None = None, spent: Ints | None = None, expected: Floats | None = None,
+        push: Floats | None = None,
     ) -> None:  # fmt: skip
         """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `joints`,
-        `spent`: the joints of this step, and what `Drives` has by that name, if contacts have shown them."""
+        `spent`: the joints of this step, and what `Drives` has by that name, if contacts have shown them. `expected`:
+        impulses (nc, 3) that the contacts are expected to have, as those of the last step; or `push` if it is known."""
         positive("time step", dt)
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
@@ -105,15 +111,28 @@ class ContactSystem:
         owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
         halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
         self.contact_map = ContactMap(world.comm, rows, halo, row)
-        free = free_velocities(world, near, dt, self.drives)
+        self.attraction = attraction(world, contacts, dt)
+        self.push = push
+        if self.push is None and turns_unlike_spheres(world):
+            impulse = np.zeros((len(contacts), 3)) if expected is None else expected[: len(contacts)]
+            self.push = self.contact_map.momenta(self.net(impulse))
+        change = None
+        if self.push is not None:
+            change = np.empty_like(self.push)
+            scale(self.contact_map.given.root, self.push, change)
+        free, self.middle = free_velocities(world, near, dt, self.drives, change)
         self.applied = applied_impulses(world, dt) if world.loaded else None
-        if world.loaded:
+        if world.loaded or change is not None:
             halo.update(free)
         freely, rounding = closing(rows.frame, arm, row, free)
-        self.joints = joint_coupling(world, dt) if joints is None else joints
+        self.joints = joint_coupling(world, dt, self.push) if joints is None else joints
         if self.joints is not None:
             here, slot = slots(world, near.bodies.id)
+            spin = self.joints.spin[slot]
+            free[here, 3:] = np.where(np.isnan(spin), free[here, 3:], spin)
             free[here] += self.joints.change[slot]
+            if self.middle is not None:
+                self.middle[here[here < owned]] = self.joints.middle[slot[here < owned]]
             freely, more = closing(rows.frame, arm, row, free)
             rounding += more
             own = here < owned
@@ -135,7 +154,6 @@ class ContactSystem:
         if contacts.drift is not None:
             freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
         self._attracted: Floats | float = 0.0  #: mass-scaled momenta of the attraction
-        self.attraction = attraction(world, contacts, dt)
         if self.attraction is not None:
             self._attracted = momentum = self.contact_map.momenta(along_normal(-self.attraction))
             self.free_velocity = self.velocity_with(momentum)
@@ -210,6 +228,18 @@ class ContactSystem:
             momentum = self.contact_map.coupled(momentum)
         scale(self.contact_map.given.root, momentum, change)
         return self.free_velocity + change
+
+    def kept(self, world: World, velocity: Floats) -> Floats:
+        """The velocities (owned, 6) with which bodies go into the next step, where those of this one are `velocity`:
+        the same but of bodies that are no spheres, see `dem.free_motion.kept_spin`."""
+        if self.middle is None:
+            return velocity
+        own = self.near.bodies.take(slice(len(velocity)))
+        out = velocity.copy()
+        rows = np.flatnonzero(np.isfinite(self.middle[:, 0]))
+        spins = velocity[rows, 3:], self.middle[rows]
+        out[rows, 3:] = kept_spin(own.quaternion[rows], *spins, own.inertia[rows], self.dt)
+        return out
 
     def set_rate(self, world: World, momentum: Floats) -> None:
         """Give a cell that deforms the rate of its periods in this step, for the momenta of `velocity_with`;

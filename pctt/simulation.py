@@ -42,6 +42,7 @@ from dem.start import step_remark
 from dem.step import Step
 from dem.time_step import fall_remark, reason
 from dem.together import meet, together
+from dem.turns import TurnWatch
 from dem.world import (
     set_load,
     set_motion,
@@ -130,6 +131,8 @@ class Simulation:
         falls = "" if restart else comm.bcast(fall_remark(scene, self.settings.dt))
         if large := step_remark(self.world, self.settings.dt) or falls:
             warn(comm, large)
+        self._turns = TurnWatch()
+        self._tell_turns()
         self.restart = str(restart)  #: the file from which it goes on
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
@@ -186,7 +189,13 @@ class Simulation:
             warn(self.comm, report.jump_words(self.figures, self._program))
         if cause := self.overlap_watch.look(self.last, figures["closing_speed"]):
             warn(self.comm, self.overlap_watch.words(cause, self.steps, self._program))
+        self._tell_turns()
         return self.figures
+
+    def _tell_turns(self) -> None:
+        """Warn of a body that turns too far in a step; collective."""
+        if words := self._turns.look(self.world, self.settings.dt):
+            warn(self.comm, words)
 
     def run(
         self,
