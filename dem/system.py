@@ -71,6 +71,7 @@ class ContactSystem:
         contact_map: G, with the halo of the bodies; the rows of its tables are those of `near`
         problem_map: G of the cone problem: with the rows of turning, where contacts resist it
         free_velocity (owned, 6): velocities without contacts, but with their attraction
+        free_large (large, 6): the same of the large bodies, without attraction, on all ranks
         resistance: the rows of `dem.rolling`, or None
         attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.cohesion`
         drives: of the large bodies, the same on all ranks
@@ -118,7 +119,7 @@ class ContactSystem:
             coupling = self.joints.matrix
             self.contact_map = JointedMap(self.contact_map, here[own], slot[own], coupling)
         self.free_velocity = free[:owned]
-        self._free_large = free[near.grains + near.ghosts :]
+        self.free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
         self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
         self.held = np.zeros((len(contacts), 2))
@@ -253,7 +254,7 @@ class ContactSystem:
     def drive_impulse(self, large: Floats) -> Floats:
         """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities
         `large` (large, 6) after the step."""
-        line, slip = self.drives.line, self._free_large - large
+        line, slip = self.drives.line, self.free_large - large
         return self.drives.impulse + (self.drives.grip * np.einsum("bi,bi->b", line, slip))[:, None] * line
 
     def works(

@@ -7,7 +7,8 @@ one that is easy costs nothing more.
 
 For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path. Problems
-of few contacts are the exception: there it goes on to the end.
+of few contacts are the exception: there it goes on to the end. It also takes these to an aim beyond the limits: it
+needs a few more steps for that, where APGD may need hundreds.
 
 With joints, which the sparse systems of the conic method do not have, it is APGD alone.
 """
@@ -63,8 +64,11 @@ def solve(
     few = not alone and newton.has_few(problem)
     most = limits.max_it if alone else options.iterations(problem.size, limits.tol, coulomb, few)
     begun = min(limits.max_it, problem.comm.bcast(most))
-    last = first = attempt(apgd, guess, replace(limits, max_it=begun), apgd.APGD())
-    if not first.final and begun < limits.max_it:
+    last = first = attempt(apgd, guess, replace(limits, max_it=begun, spare=0 if few else limits.spare), apgd.APGD())
+    if few and first.converged and first.residual > limits.aimed:
+        last = min(first, attempt(conic, guess, limits, conic.Conic(), newton), key=lambda result: result.residual)
+        tried.sort(key=lambda result: result is last)
+    elif not first.final and begun < limits.max_it:
         inner, settings, begin = replace(limits, max_it=min(60, limits.max_it)), conic.Conic(), guess
         if not coulomb:
             settings = conic.Conic(start=min(settings.start, options.start * first.residual))

@@ -25,6 +25,7 @@ from dem.world import World
 from pctt import ccp, log
 from pctt.ccp.cone import Array
 from pctt.options import OptionError
+from pctt.run import rest
 from pctt.run.dump import Dump
 from pctt.run.settings import Settings
 
@@ -235,9 +236,10 @@ class Stepper:
         """Solve a problem of the step as the settings say."""
         settings = self.settings
         with log.phase("solve"):
-            return ccp.solve(
-                problem, guess, settings.solver, settings.limits, settings.options, self.newton, settings.law
-            )
+            limits = rest.limits_of(settings.limits, self.world, self.system)
+            result = ccp.solve(problem, guess, settings.solver, limits, settings.options, self.newton, settings.law)
+            rest.account(self.world, limits, result)
+            return result
 
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
