@@ -73,6 +73,7 @@ def restored_world(
     world.time, world.step = float(replicated["time"]), int(replicated["step"])
     expected = np.array(replicated["expected"]) if "expected" in replicated else None
     world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
+    world.spare = float(replicated.get("spare", World.spare))
     _restore_cell(world, replicated)
     _refuse_impossible(world)
     if len(replicated["slabs"]) != comm.size + 1:
@@ -83,6 +84,7 @@ def restored_world(
 def _refuse_impossible(world: World) -> None:
     """ValueError on all ranks for a state that `dem.scene` would refuse to start with; collective."""
     wrong = [] if np.isfinite(world.time) and world.time >= 0.0 <= world.step else ["time or step"]
+    wrong += [] if np.isfinite(world.spare) else ["spare"]
     for table, what in ((world.grains, "grain"), (world.large, "large body")):
         grains = what == "grain"
         heavy = np.concatenate([table.mass, table.inertia.ravel()])

@@ -173,24 +173,33 @@ def _kept(stiffness, compliance, dt, held, impulse, c):
 
 @loop
 def spring_energies(
-    stiffness: Floats, compliance: Floats, dt: float, gap: Floats, after: Floats, held: Floats, impulse: Floats
-) -> tuple[float, float, float, float]:
+    stiffness: Floats, compliance: Floats, dt: float, past: Floats, gap: Floats, after: Floats, last: Floats,
+    held: Floats, impulse: Floats,
+) -> tuple[float, float, float, float]:  # fmt: skip
     """What contacts hold as springs at the start and at the end of a step, along the normals and then along the
     tangents [J]. Rigid ones hold nothing.
 
-    That is k/2 d^2 of an overlap d, of the gaps (nc,) at the start and `after` the step [m]; and h^2 / (2 k_t dt^2) of
-    the impulse h that a tangential spring holds, `held` (nc, 2) at the start."""
+    That is k/2 d^2 of an overlap d, of the `gap` (nc,) at the start and `after` the step, but of no more overlap than
+    the normal impulses of this step and of the `last` one (nc,), which began with the gaps `past` [m], make: what a
+    solver or the curves of surfaces leave beyond has done no work, and an implicit step does not give it back. And
+    h^2 / (2 k_t dt^2) of the impulse h that a tangential spring holds, `held` (nc, 2) at the start."""
     start, end, strained, strained_at_end = 0.0, 0.0, 0.0, 0.0
     for c in range(len(gap)):
         if np.isinf(stiffness[c]):
             continue
         k, per = stiffness[c], TANGENTIAL * stiffness[c] * dt**2
-        start += 0.5 * k * max(-gap[c], 0.0) ** 2
-        end += 0.5 * k * max(-after[c], 0.0) ** 2
+        start += 0.5 * k * _borne(k, compliance[c, 0], dt, past[c], gap[c], last[c]) ** 2
+        end += 0.5 * k * _borne(k, compliance[c, 0], dt, gap[c], after[c], impulse[c, 0]) ** 2
         one, other = _kept(stiffness, compliance, dt, held, impulse, c)
         strained += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / per
         strained_at_end += 0.5 * (one**2 + other**2) / per
     return start, end, strained, strained_at_end
+
+
+@inlined
+def _borne(stiffness, compliance, dt, begin, gap, impulse):
+    left = (1.0 - stiffness * dt**2 * compliance) * max(-begin, 0.0)  # of an overlap that no impulse has changed
+    return max(min(-gap, dt * compliance * impulse + left), 0.0)
 
 
 def _impacts(scene: Scene, pressed: Pressing, dt: float) -> list[tuple[Floats, float, float]]:

@@ -23,7 +23,8 @@ class Survey:
     """Of some grains."""
 
     count: int
-    #: the thinnest, the widest over its half thickness, the heaviest over this and over its square, and the fastest
+    #: the thinnest, the widest over its half thickness, the heaviest over this and over its square, and those that go
+    #: and turn fastest
     extremes: Bodies
     mass: float  #: sum [kg]
     radius: float  #: sum of the radii of the spheres about them [m]
@@ -60,7 +61,8 @@ def _of(grains: Bodies, speed: Callable[[Bodies], Floats]) -> Survey:
 def _extremes(grains: Bodies, speed: Callable[[Bodies], Floats]) -> Bodies:
     radius, half = bodies.bounding_radius(grains), bodies.least_half_thickness(grains)
     with np.errstate(over="ignore", divide="ignore"):
-        tests = (-half, radius * (radius / half), grains.mass / half, grains.mass / half**2, speed(grains))
+        heavy = grains.mass / half, grains.mass / half**2
+        tests = (-half, radius * (radius / half), *heavy, speed(grains), bodies.turning(grains))
     return grains.take(np.array([np.argmax(values) for values in tests]))
 
 

@@ -1,7 +1,8 @@
 """The time step and the contact distance that a scene needs, from its sizes and speeds.
 
-Two times matter: that in which the fastest tool goes a radius, and that in which a grain falls about half of one,
-sqrt(R / g). docs/mechanics.md has the errors of forces on tools over dt.
+Three times matter: that in which the fastest tool goes a radius, that in which a grain falls about half of one,
+sqrt(R / g), and that in which a body that is no sphere turns by a radian. docs/mechanics.md has the errors of forces on
+tools over dt.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from dem.motion import top_speed
 from dem.pressing import Pressing, pressing
 from dem.scene import LargeBody, Scene
 from dem.shapes import Plane
+from dem.turns import TURN, turning_of_large
 
 DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/mechanics.md has the errors of forces
 FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
@@ -27,9 +29,9 @@ PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same an
 
 
 def recommended(scene: Scene) -> float:
-    """The time step [s] with which forces on tools are within a few per cent of those of smaller steps, and grains that
-    fall go no further than FALLS of their half thicknesses, to two digits; 0.01 s for a scene without tools and
-    gravity."""
+    """The time step [s] with which forces on tools are within a few per cent of those of smaller steps, grains that
+    fall go no further than FALLS of their half thicknesses, and bodies that are no spheres turn by no more than TURN at
+    time zero, to two digits; 0.01 s for a scene without all that."""
     return min(needs(scene).values())
 
 
@@ -45,6 +47,8 @@ def needs(scene: Scene) -> dict[str, float]:
         found[f"falls to {falls:.3g} m/s"] = _rounded(FALLS * smallest(scene) / falls)
     if pushed > math.hypot(*scene.gravity):
         found[f"loads of {pushed:.3g} m/s^2"] = _rounded(FALLING * math.sqrt(smallest(scene) / pushed))
+    if (spin := fastest_turn(scene)) > 0.0:
+        found[f"bodies that turn at {spin:.3g} rad/s"] = _rounded(TURN / spin)
     if pressed.highest > 0.0:
         found[f"springs of {pressed.highest:.3g} rad/s"] = _rounded(SPRINGS / pressed.highest)
     return found
@@ -101,6 +105,12 @@ def fastest_tool(scene: Scene) -> float:
 def fastest_grain(scene: Scene) -> float:
     """The greatest speed of a grain at time zero [m/s]; in a sheared cell beside the flow."""
     return float(scene.speeds(scene.expected()).max(initial=0.0))
+
+
+def fastest_turn(scene: Scene) -> float:
+    """The greatest angular speed at time zero of a body that is no sphere and that forces move [rad/s]."""
+    grains, large = bodies.turning(scene.expected()), turning_of_large(scene.large(), scene.large_bodies)
+    return float(np.concatenate([grains, large]).max(initial=0.0))
 
 
 def _fall(scene: Scene) -> float:

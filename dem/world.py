@@ -95,6 +95,7 @@ class World:
     servo: Servo | None = None  #: of the size of the cell
     time: float = 0.0  #: [s]
     step: int = 0  #: number of steps done
+    spare: float = 3000.0  #: iterations that steps at rest may spend beyond the limits of the solver, `pctt.run.rest`
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
 
@@ -133,6 +134,7 @@ class World:
         replicated.update(slabs=self.slabs, time=np.array(self.time), step=np.array(self.step))
         if self.expected is not None:
             replicated["expected"] = self.expected
+        replicated["spare"] = np.array(self.spare)
         if self.tallies:
             replicated["tallies"] = as_array(self.tallies)
         if self.shear is not None:
@@ -244,6 +246,11 @@ class World:
             for row, body in enumerate(self.large_bodies)
             if not isinstance(body.motion, Dynamic)
         }
+
+
+def turns_unlike_spheres(world: World) -> bool:
+    """Whether a body that turns freely may do so in another way than a sphere; the same on all ranks."""
+    return not world.only_spheres or bool(np.isfinite(world.large.inertia).all(axis=1).any())
 
 
 def set_motion(world: World, name: str, motion: Motion | None = None, **values: Any) -> None:

@@ -42,6 +42,7 @@ from dem.start import step_remark
 from dem.step import Step
 from dem.time_step import fall_remark, reason
 from dem.together import meet, together
+from dem.turns import TurnWatch
 from dem.world import (
     set_load,
     set_motion,
@@ -130,12 +131,14 @@ class Simulation:
         falls = "" if restart else comm.bcast(fall_remark(scene, self.settings.dt))
         if large := step_remark(self.world, self.settings.dt) or falls:
             warn(comm, large)
+        self._turns = TurnWatch()
+        self._tell_turns()
         self.restart = str(restart)  #: the file from which it goes on
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
         watch = OverlapWatch(scene, self.settings, float(self.world.pairs.stiffness.min()))
         self.overlap_watch = comm.bcast(watch)  # processors may round in other ways
-        self._program = program
+        self._program, self._jumped = program, False
         self.last: Step | None = None
         self.figures: dict[str, Any] = {}
         self.output: Writer | None = None
@@ -181,11 +184,18 @@ class Simulation:
             with log.phase("output"):
                 output.add(figures, self._row)
         self.figures = self._row | figures
-        if figures["energy_jump"]:
-            warn(self.comm, report.jump_words(self.figures))
+        if figures["energy_jump"] and not self._jumped:
+            self._jumped = True
+            warn(self.comm, report.jump_words(self.figures, self._program))
         if cause := self.overlap_watch.look(self.last, figures["closing_speed"]):
             warn(self.comm, self.overlap_watch.words(cause, self.steps, self._program))
+        self._tell_turns()
         return self.figures
+
+    def _tell_turns(self) -> None:
+        """Warn of a body that turns too far in a step; collective."""
+        if words := self._turns.look(self.world, self.settings.dt):
+            warn(self.comm, words)
 
     def run(
         self,
@@ -316,7 +326,7 @@ class Simulation:
             "contacts",
             key=own.key,
             bodies=np.searchsorted(np.append(self.ids, self.world.large.id), np.stack([id[own.a], id[own.b]], axis=1)),
-            point=wrapped(own.point, self.world.period, self.world.shear),
+            point=step.point,
             frame=step.system.frame,
             gap=own.gap,
             moved=np.zeros_like(own.point) if own.moved is None else own.moved,

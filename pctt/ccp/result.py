@@ -12,7 +12,7 @@ import numpy as np
 
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import Errors
-from pctt.options import FRACTION, option
+from pctt.options import FRACTION, number, option
 
 if TYPE_CHECKING:
     from pctt.ccp.accuracy import Accuracy
@@ -42,6 +42,10 @@ class Limits:
         math.inf, "speed at which a contact may still close where a cone problem counts as solved; inf: any",
         unit="m/s", check=("a positive number, or inf", lambda x: x > 0),
     )  # fmt: skip
+    aim: float = number(
+        1.0, "where that pays, a method goes on to this part of the limits, for as many iterations as are spare"
+    )
+    spare: int = number(0, "the iterations for it; the conic method, which takes a few, needs none")
     fallback: bool = option(True, "where the solver does not converge, another one goes on from its impulses")
 
     def residual(self, errors: Errors) -> float:
@@ -65,6 +69,11 @@ class Limits:
         return f"squeezed: {above}, at a natural residual of {natural:.1e}, {ENOUGH:g} times below the tolerance"
 
     @property
+    def aimed(self) -> float:
+        """The residual to go on to."""
+        return self.aim * self.tol
+
+    @property
     def met(self) -> str:
         """The reason of a result that meets them."""
         others = {"closing work": self.closing_work, "closing speed": self.closing_speed}
@@ -72,9 +81,9 @@ class Limits:
         return " and ".join([", ".join(names[:-1]), names[-1]][len(names) < 2 :]) + " below the tolerance"
 
     def to(self, tol: float) -> Limits:
-        """For another tolerance of the same residual."""
+        """For another tolerance of the same residual, and no aim beyond it."""
         work, speed = (limit / self.tol * tol for limit in (self.closing_work, self.closing_speed))
-        return dataclasses.replace(self, tol=tol, closing_work=work, closing_speed=speed)
+        return dataclasses.replace(self, tol=tol, closing_work=work, closing_speed=speed, aim=1.0)
 
 
 class Status(Enum):
@@ -111,7 +120,9 @@ class Result:
     law : RELAXATION, COULOMB or FIXED_POINT: the law of the impulses and of the residuals
     accuracy : the figures of the impulses; set by `pctt.ccp.solve`
     momentum : (6m,) G' g, or g where the problem is given by N; set by `pctt.ccp.solve`
+    beyond : iterations among them after the limits were met, towards the aim beyond these
     asked : what the asked method made of it, where another one had to follow; else None
+    exhausted : whether it has tried the other methods, too
     """
 
     impulse: Array
@@ -128,7 +139,9 @@ class Result:
     law: str = RELAXATION
     accuracy: Accuracy | None = None
     momentum: Array = field(default_factory=lambda: np.zeros(0))
+    beyond: int = 0
     asked: Result | None = None
+    exhausted: bool = False
 
     @property
     def converged(self) -> bool:
@@ -141,6 +154,6 @@ class Result:
 
     def after(self, *earlier: Result) -> Result:
         """This result, with what the results before it have cost."""
-        for count in ("iterations", "ksp_its", "fallbacks", "newton_its"):
+        for count in ("iterations", "beyond", "ksp_its", "fallbacks", "newton_its"):
             setattr(self, count, sum(getattr(result, count) for result in (self, *earlier)))
         return self

@@ -182,8 +182,8 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
         same_rows(file, (f"world/large_{name}" for name in columns))
         count, number = same_rows(file, (f"grains/{name}" for name in columns)), same_rows(file, CONTACTS)
         replicated = {n: file[f"world/{n}"][()] for n in (*(f"large_{n}" for n in columns), "slabs", "time", "step")}
-        # of springs, of sources and outlets, of a sheared cell, of its stress
-        for name in {"expected", "tallies", "shear", "servo"} & set(file["world"]):
+        # of springs, of sources and outlets, of a sheared cell, of its stress; not in files of earlier versions
+        for name in {"spare", "expected", "tallies", "shear", "servo"} & set(file["world"]):
             replicated[name] = file[f"world/{name}"][()]
         changes = [file[f"world/{n}"].asstr()[0] if f"world/{n}" in file else "{}" for n in CHANGES]
         _refuse_other_slabs(replicated["slabs"], count)

@@ -61,7 +61,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: APGD, cou
         impatient = replace(options, patience=min(options.patience, 300))  # double precision takes over
         progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, impatient)
         rough_impulse = _descend(progress, guess, options)
-        if progress.best <= limits.tol:
+        if progress.best <= limits.aimed:
             return progress.result()
         if progress.iterations:  # else rounding would spoil a guess that is good already
             guess = rough_impulse

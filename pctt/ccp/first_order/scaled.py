@@ -247,6 +247,7 @@ class Progress:
         self._size, self._last_look = 0.0, (1.0, 0.0)  # of the last step; the residual and the size at the last look
         self._suspicious, self._unbounded = limits.tol, ""
         self._gain = (np.inf, self.iterations)  # residual and iteration of the last progress
+        self._met: int | None = None  # the iteration at which the limits were met
 
     def is_due(self, size: float) -> bool:
         """Whether `goes_on` will look: after ``check`` iterations, or a few after the last look where the residual
@@ -255,8 +256,9 @@ class Progress:
 
         Before there was a step it is taken for RATIO times |L step| / |x|."""
         residual, size_then = self._last_look
+        wanted = self.limits.tol if self._met is None else self.limits.aimed
         few = self._next_look - self.check + 3
-        if self.iterations >= few and residual * size <= 0.9 * self.limits.tol * size_then:
+        if self.iterations >= few and residual * size <= 0.9 * wanted * size_then:
             self._next_look = self.iterations
         self._size = size
         return self.iterations >= min(self._next_look, self.limits.max_it)
@@ -285,9 +287,15 @@ class Progress:
         """Of the best point (nc, 3)."""
         return self.problem.impulse(self._point)
 
+    @property
+    def beyond(self) -> int:
+        """The iterations since the limits were met."""
+        return 0 if self._met is None else self.iterations - self._met
+
     def result(self) -> Result:
         status = Status.CONVERGED if self.best <= self.limits.tol else self.status
-        return Result(self.impulse, status, self.reason, self.best, self.iterations, history=self.history)
+        given = self.impulse, status, self.reason, self.best, self.iterations
+        return Result(*given, beyond=self.beyond, history=self.history)
 
     def _residual(self, x: Array, gradient: Array | None) -> float:
         """The residual that the tolerance is for; nan where x or its gradient is no number."""
@@ -311,7 +319,9 @@ class Progress:
 
     def _why_stop(self, residual: float) -> tuple[Status, str]:
         """The reason is empty as long as there is none."""
-        if residual <= self.limits.tol:
+        if self._met is None and residual <= self.limits.tol:
+            self._met = self.iterations
+        if residual <= self.limits.aimed or (self._met is not None and self.beyond >= self.limits.spare):
             return Status.CONVERGED, self.limits.met
         if self._unbounded:
             return Status.UNBOUNDED, self._unbounded

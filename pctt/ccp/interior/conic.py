@@ -83,7 +83,7 @@ def solve(
             best = found.g
         waited = 0 if found.errors.natural <= 0.9 * least or gap <= 0.5 * last_gap else waited + 1
         least, last_gap = min(found.errors.natural, least), gap
-        done = history[-1] <= limits.tol or unbounded
+        done = history[-1] <= limits.aimed or unbounded
         if done or len(history) > limits.max_it or waited > options.patience:
             break
         # scaling
@@ -109,7 +109,7 @@ def solve(
             at = cones.moved(at, direction, step)
     iterations = len(history) - 1
     status, words = Status.STALLED, f"stalled after {iterations} iterations"
-    if history[-1] <= limits.tol:
+    if min(history) <= limits.tol:
         status, words = Status.CONVERGED, limits.met
     elif iterations == limits.max_it:
         status, words = Status.ITERATION_LIMIT, f"{iterations} iterations"

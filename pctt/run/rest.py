@@ -1,0 +1,91 @@
+"""Whether the bodies are at rest, and how far steps then go beyond the limits of the solver.
+
+A step begins with the impulses of the last one. What these lack of a solution moves bodies, and so it is what the next
+step has to mend: in a bed that is stirred the motion itself changes more. At rest it is all that there is to do. A
+solver that stops as soon as the limits are met shakes bodies at rest for ever, by as much as these allow; one that goes
+on stops the shaking, and then each step has nothing left to do. So at rest going on costs no more iterations, in all.
+
+Many contacts may need more iterations than that is worth, in a bed, say. So the iterations beyond the limits are
+counted (`World.spare`): so many as SPARE, and a SHARE of all iterations, may lead nowhere.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from dem import bodies
+from dem.arrays import Floats
+from dem.compiled import loop
+from dem.exchange import reduced
+from dem.record import energy
+from dem.system import ContactSystem
+from dem.world import World
+from pctt.ccp import Limits, Result
+
+SLOW = 0.3  #: kinetic energy of bodies at rest, over that of a step of free fall: loose steps shake them by 0.2
+STILL = 2e-3  #: the same where many contacts are worth iterations: beds that settle have 0.004 to 0.07
+AIM = 1e-4  #: residual to go on to, over that of the limits: with 1e-3 boxes with masses 1 : 1e4 creep by 4 um/s
+ATTEMPT = 100  #: iterations beyond the limits in a step, of more than few contacts
+SPARE = World.spare  #: and all that may lead nowhere: a wall of 144 boxes takes 2,400 until each step needs 20
+SHARE = 0.1  #: and this part of all iterations
+
+
+def limits_of(limits: Limits, world: World, system: ContactSystem) -> Limits:
+    """The limits of a step: with an aim beyond them where bodies are at rest; collective."""
+    part = _kinetic_part(world, system)
+    if part >= SLOW:
+        return limits
+    spare = ATTEMPT if part < STILL and world.spare >= ATTEMPT else 0
+    return dataclasses.replace(limits, aim=AIM, spare=spare)
+
+
+def account(world: World, limits: Limits, result: Result) -> None:
+    """Count what a step has spent beyond its limits, if it did not reach the aim; a step that does may spend all."""
+    if limits.spare and result.residual <= limits.aimed:
+        world.spare = SPARE
+    else:
+        world.spare = min(SPARE, world.spare - result.beyond + SHARE * result.iterations)
+
+
+def _kinetic_part(world: World, system: ContactSystem) -> float:
+    """The kinetic energy of the bodies over that which a step of free motion would give them; inf where a tool, a belt
+    or a flow passes them faster than that. Collective."""
+    grains, large, free = world.grains, world.large, system.free_large
+    moves = np.flatnonzero(bodies.is_dynamic(large))
+    driven = large.take(moves)
+    fall = falling_energy(grains.mass, grains.velocity, system.free_velocity[: len(grains)])
+    (kinetic, fall, mass), _ = reduced(
+        world.comm, (energy(grains, world.gravity)[0], fall, float(grains.mass.sum())), ()
+    )
+    kinetic += energy(driven, world.gravity)[0]
+    fall += falling_energy(driven.mass, driven.velocity, free[moves])
+    if kinetic >= SLOW * fall:  # so a bed that is stirred pays for two sums
+        return np.inf
+    tools = free.copy()
+    tools[moves] = 0.0
+    _, (fastest,) = reduced(world.comm, (), (_passing(system, tools),))
+    passes = 0.5 * (mass + float(driven.mass.sum())) * fastest**2 > fall
+    return np.inf if passes else float(kinetic / fall)
+
+
+@loop
+def falling_energy(mass: Floats, before: Floats, after: Floats) -> float:
+    """The kinetic energy [J] of the change of the linear velocities of n bodies, from `before` (n, 6) to `after`."""
+    energy = 0.0
+    for n in range(len(mass)):
+        for k in range(3):
+            energy += 0.5 * mass[n] * (after[n, k] - before[n, k]) ** 2
+    return energy
+
+
+def _passing(system: ContactSystem, tools: Floats) -> float:
+    """The greatest component [m/s] of a velocity that tools with the velocities (large, 6), belts and the flow of a
+    cell have at a contact of this rank."""
+    at_contacts = [known for known in (system.surface, system.drift) if known is not None]
+    if tools.any():
+        table = np.zeros_like(system.near.bodies.velocity)
+        table[len(table) - len(tools) :] = tools
+        at_contacts.append(system.contact_map.relative_velocities(table))
+    return max((float(np.abs(known).max(initial=0.0)) for known in at_contacts), default=0.0)
