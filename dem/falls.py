@@ -7,6 +7,7 @@ Steep surfaces end no way; where none is left, a way has no end, and counts as n
 
 from __future__ import annotations
 
+import math
 from itertools import product
 from typing import NamedTuple
 
@@ -39,7 +40,7 @@ NONE = Fall(0.0, 0.0, np.inf, 0.0)
 
 def fall(scene: Scene, acceleration: Floats, start: float = 0.0) -> Fall:
     """The fall of the grains from time zero, with the speed `start` [m/s], at this acceleration (3,) [m/s^2]."""
-    size = float(np.linalg.norm(acceleration))
+    size = math.hypot(*acceleration)
     if size == 0.0:
         return NONE
     along, grains, every = acceleration / size, scene.survey(), scene.expected()
@@ -57,8 +58,9 @@ def fall(scene: Scene, acceleration: Floats, start: float = 0.0) -> Fall:
         lasts += [_last(corners, along, planes, levels) - bed, first + half]
     elif not lasts:  # large bodies alone: the highest falls on all others
         lasts = [_last(every.position, along, planes, levels) - 2.0 * float(halves.sum() - half)]
-    reached = (float(np.sqrt(start**2 + 2.0 * size * max(way, 0.0))) for way in (max(lasts) - half, first))
-    return Fall(next(reached), next(reached), gap, column)
+    squares = (start * start + 2.0 * size * max(way, 0.0) for way in (max(lasts) - half, first))
+    last, block = (math.sqrt(min(square, 1e300)) for square in squares)
+    return Fall(last, block, gap, column)
 
 
 def way_of(scene: Scene, body: LargeBody, along: Floats) -> float:

@@ -39,7 +39,7 @@ def needs(scene: Scene) -> dict[str, float]:
     """The time steps [s] that a scene needs, by what needs them."""
     found = {"grains that come to rest": for_settling(scene)}
     speed, pressed = fastest(scene), pressing(scene)
-    pushed = max(float(np.linalg.norm(acceleration)) for acceleration in pressed.accelerations)
+    pushed = max(math.hypot(*acceleration) for acceleration in pressed.accelerations)
     falls = max([falling(scene, pressed), *(speed for _, speed in pressed.impacts)])
     if speed > 0.0:
         found[f"what moves at {speed:.3g} m/s"] = _rounded(DRIVEN * smallest(scene) / speed)

@@ -114,7 +114,7 @@ def test_ballast_of_an_unknown_shape_is_refused():
 
 
 def test_the_belt_carries_the_capsules():
-    _, records = run("conveyor", 100, scene_layers="1")
+    _, records = run("conveyor", 100, scene_layers="1", dt="0.0071")
     assert records["arrived"][-1] > 0
     assert records["lost"][-1] == 0
     assert records["power [W]"].sum() > 0

@@ -155,7 +155,7 @@ def test_lines_are_plain_where_there_is_no_terminal(program, settled):
     assert done.stderr == ""
     assert "\r" not in done.stdout
     assert "\033" not in done.stdout
-    head, first = (done.stdout.splitlines()[k].split() for k in (3, 4))
+    head, first = (done.stdout.splitlines()[k].split() for k in (4, 5))
     assert head[:3] == ["step", "time", "s"]
     assert int(first[0]) > 90
 
