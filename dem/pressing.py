@@ -101,7 +101,7 @@ def _tools(scene: Scene) -> tuple[float, list[tuple[float, float]]]:
     come that meet a few grains alone, or none. Beneath a wide one a bed gives way, the more so if it is a servo."""
     greatest, impacts = 0.0, []
     radius = float(bodies.bounding_radius(scene.expected()).min())
-    count = np.inf if scene.sources else float(scene.count)
+    count, falls = np.inf if scene.sources else float(scene.count), math.hypot(*scene.gravity)
     for body in scene.large_bodies:
         motion = body.motion
         if not isinstance(motion, Dynamic):
@@ -117,7 +117,10 @@ def _tools(scene: Scene) -> tuple[float, list[tuple[float, float]]]:
         greatest = max(greatest, share * size)
         if share == 1.0 and force.any():
             way = max(way_of(scene, body, along) - (2.0 * radius if count else 0.0), 0.0)
-            impacts.append((body.mass, math.sqrt(2.0 * size / body.mass * way)))
+            speed = math.sqrt(2.0 * size / body.mass * way)
+            if isinstance(motion, Guided) and motion.speed is not None and motion.force >= body.mass * falls:
+                speed = min(speed, abs(motion.speed))  # which the servo keeps
+            impacts.append((body.mass, speed))
     return greatest, impacts
 
 

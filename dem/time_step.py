@@ -39,11 +39,14 @@ def needs(scene: Scene) -> dict[str, float]:
     """The time steps [s] that a scene needs, by what needs them."""
     found = {"grains that come to rest": for_settling(scene)}
     speed, pressed = fastest(scene), pressing(scene)
+    pushed = max(float(np.linalg.norm(acceleration)) for acceleration in pressed.accelerations)
     falls = max([falling(scene, pressed), *(speed for _, speed in pressed.impacts)])
     if speed > 0.0:
         found[f"what moves at {speed:.3g} m/s"] = _rounded(DRIVEN * smallest(scene) / speed)
     if falls > 0.0:
         found[f"falls to {falls:.3g} m/s"] = _rounded(FALLS * smallest(scene) / falls)
+    if pushed > math.hypot(*scene.gravity):
+        found[f"loads of {pushed:.3g} m/s^2"] = _rounded(FALLING * math.sqrt(smallest(scene) / pushed))
     if (spin := fastest_turn(scene)) > 0.0:
         found[f"bodies that turn at {spin:.3g} rad/s"] = _rounded(TURN / spin)
     if pressed.highest > 0.0:

@@ -138,7 +138,7 @@ class Simulation:
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
         watch = OverlapWatch(scene, self.settings, float(self.world.pairs.stiffness.min()))
         self.overlap_watch = comm.bcast(watch)  # processors may round in other ways
-        self._program = program
+        self._program, self._jumped = program, False
         self.last: Step | None = None
         self.figures: dict[str, Any] = {}
         self.output: Writer | None = None
@@ -184,8 +184,9 @@ class Simulation:
             with log.phase("output"):
                 output.add(figures, self._row)
         self.figures = self._row | figures
-        if figures["energy_jump"]:
-            warn(self.comm, report.jump_words(self.figures))
+        if figures["energy_jump"] and not self._jumped:
+            self._jumped = True
+            warn(self.comm, report.jump_words(self.figures, self._program))
         if cause := self.overlap_watch.look(self.last, figures["closing_speed"]):
             warn(self.comm, self.overlap_watch.words(cause, self.steps, self._program))
         self._tell_turns()

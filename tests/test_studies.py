@@ -40,15 +40,10 @@ def test_pages_name_studies_that_there_are():
             assert (ROOT / "run" / name).exists() or (ROOT / "pctt" / "run" / name).exists(), f"{page}: run/{name}"
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "trains ranks 1 -caps 10 -every 12",
-        "trains reuse 1 -steps 2",
-        "trains scaling 1",
-        "ranks unfoldings 1",
-    ],
-)
+QUICK = ["trains ranks 1 -caps 10 -every 12", "trains reuse 1 -steps 2", "trains scaling 1", "ranks unfoldings 1"]
+
+
+@pytest.mark.parametrize("words", QUICK)
 def test_a_study_of_the_smallest_size_runs(words, tmp_path):
     name, *rest = words.split()
     done = subprocess.run([sys.executable, STUDIES / f"{name}.py", *rest], cwd=tmp_path, capture_output=True, text=True)
@@ -56,8 +51,8 @@ def test_a_study_of_the_smallest_size_runs(words, tmp_path):
     assert list((tmp_path / "results").glob(f"{name}*.json"))
 
 
-#: Every study at a small size. Those of other programs, which have to be there, and `convert_problems`, whose files
-#: tests/ccp/test_convert_problems.py has, are left out.
+#: Every other study at a small size, but those of other programs, which have to be there, and `convert_problems`, whose
+#: files tests/ccp/test_convert_problems.py has.
 SMALL = [
     "measure steps 1", "measure preconditioners 1 -every 8 -names pbjacobi,tt", "measure laws 1", "measure paper -n 1",
     "measure pdip -n 1", "time_steps mixer4 --starts 1 --settings 6", "windows shear4 --states 1 --settings default "
@@ -66,8 +61,7 @@ SMALL = [
     "validate closed_forms", "seeds 1,2 -scene plane_shear -seconds 0.02", "h_stop 2 --rate 40",
     "features loads --steps 1 --rounds 1", "shapes -n 3 -steps 5 -shapes spheres,cubes",
     "torture plant cell -n 2 -kills 3 -steps 20", "structure run", "sparse -names pbjacobi",
-    "trains ranks 1 -every 12 -caps 10", "trains reuse 1 -steps 2", "trains scaling 1", "ranks unfoldings 1",
-    "ranks bounds 1 -form perspective", "ranks functions", "kernels -only imq1 -ways auto plain", "table_plots",
+    "ranks functions", "kernels -only imq1 -ways auto plain", "table_plots",
     "pictures incline -n 2",
 ]  # fmt: skip
 ELSEWHERE = {"compare_chrono", "compare_liggghts", "convert_problems"}
@@ -76,7 +70,7 @@ DRAWS = {"structure": "matplotlib", "table_plots": "matplotlib", "pictures": "vt
 
 def test_the_small_studies_are_all():
     files = {name for name in re.findall(r"^\| `([a-z_]+)", PAGE, re.MULTILINE)}
-    assert files - ELSEWHERE == {words.split()[0] for words in SMALL}
+    assert files - ELSEWHERE == {words.split()[0] for words in QUICK + SMALL}
 
 
 @pytest.fixture(scope="module")

@@ -106,7 +106,7 @@ def turn_ahead(
             end = plus(plus(plus(plus(center[a], -1.0, center[b]), h, V), -h, W), -1.0, beside)
             end = plus(plus(end, 1.0, plus(ahead, -1.0, lever)), 1.0, other)
             n, after = _from_host(end, kind[b], quaternion[b], size[b], size[a, 0], w, h)
-            half = 0.5 * gap[c]
+            half = 0.5 * min(gap[c], 0.0)
             own = plus(ahead, size[a, 0] + half, n)
             their = plus(plus(beside, 1.0, end), size[a, 0] + after - half, n)
         else:
@@ -117,6 +117,9 @@ def turn_ahead(
         if h == 0.0 or dot(n, n) == 0.0:
             continue
         linear[c] = after - h * dot(n, plus(plus(W, 1.0, cross(w, their)), -1.0, plus(V, 1.0, cross(u, own))))
+        if not here:
+            half = 0.5 * (after - min(linear[c], 0.0))
+            own, their = plus(own, -half, n), plus(their, half, n)
         if not here:
             gap[c], deep[found] = linear[c], c
             found += linear[c] < -DEEP * _thickness(kind[a], size[a], inner)

@@ -4,8 +4,12 @@ The planes of the faces, and where those overlap the common normals of edges, gi
 are furthest apart, or overlap least (Gottschalk, Lin, Manocha 1996, "OBBTree"; which edges make a face of the
 Minkowski difference, Gregorius 2013, "The separating axis test between convex polyhedra"). Where that is the normal of
 a face, the face is laid over the face of the other that looks back at it, and the corners of the polygon that they
-share are contacts. Otherwise two edges cross in one point, or corners are nearest to edges or corners: the distance is
-then that of Gilbert, Johnson, Keerthi 1988.
+share are contacts. Otherwise two edges cross in one point, or corners are nearest to edges or corners.
+
+Edges along edges and corners on corners have many axes along which they overlap as little. So what is not well within a
+face has the direction in which the two polyhedra are closest without a thin skin (the distance is that of Gilbert,
+Johnson, Keerthi 1988). That is the axis itself where there is one, the mean of those that tie, and continuous between:
+convex bodies that are apart have one direction, which is a continuous function of where they are.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import numpy as np
 from dem.arrays import Floats, Ints
 from dem.compiled import loop
 from dem.contact.narrow import CORNERS, Manifold, Planes, Spheres, Touch
-from dem.polyhedra import Solid, hull
+from dem.polyhedra import Faces, Solid, hull
 from dem.vectors import dot
 
 #: Polyhedra touch on faces if the smallest gap there is within this share of the contact distance of their distance; if
@@ -34,6 +38,9 @@ SNAP = 1e-3
 #: not depend on rounding.
 TIE = 1e-9
 
+#: Radius to which edges and corners that meet count as rounded, as a share of the lesser half thickness.
+ROUND = 0.01
+
 #: Two points that are closer than this share of the lesser half thickness give no direction.
 CLOSE = 1e-7
 
@@ -46,6 +53,7 @@ class Hulls(NamedTuple):
 
     radius: Floats  #: (h,) of the spheres about their origins that enclose them
     inner: Floats  #: (h,) of the spheres about their origins within them, over `radius`
+    sharp: Floats  #: (h,) how far a vertex moves at most where the faces move in by one
     counts: Ints  #: (h, 3) vertices, faces, edges
     vertex: Floats  #: (h, v, 3)
     normal: Floats  #: (h, f, 3)
@@ -53,6 +61,7 @@ class Hulls(NamedTuple):
     side: Ints  #: (h, f, s)
     edge: Ints  #: (h, e, 2)
     wing: Ints  #: (h, e, 2)
+    inset: Floats  #: (h, v, 3) by which the vertices move there
 
     @property
     def features(self) -> int:
@@ -73,9 +82,17 @@ def hulls_of(solids: tuple[Solid, ...]) -> Hulls:
             row[tuple(slice(n) for n in column.shape)] = column
         return out
 
+    inset = [_inset(own) for own in each]
+    sharp = np.array([np.linalg.norm(own, axis=1).max() for own in inset])
     radius = np.array([np.linalg.norm(own.vertex, axis=1).max() for own in each])
     inner = np.array([np.einsum("fk,fk->f", own.normal, own.vertex[own.corner[:, 0]]).min() for own in each]) / radius
-    return Hulls(radius, inner, counts, *(padded([own[k] for own in each]) for k in range(6)))
+    return Hulls(radius, inner, sharp, counts, *(padded([own[k] for own in each]) for k in range(6)), padded(inset))
+
+
+def _inset(own: Faces) -> Floats:
+    """Vectors (v, 3) that go by one into each of the faces at a vertex; of more than three faces in the mean."""
+    faces = [own.normal[(own.corner == k).any(axis=1)] for k in range(len(own.vertex))]
+    return np.array([-np.linalg.lstsq(normal, np.ones(len(normal)), rcond=1e-2)[0] for normal in faces])
 
 
 class Polyhedra(NamedTuple):
@@ -112,7 +129,7 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
 def spheres_polyhedra(ball: Spheres, body: Polyhedra, delta: Floats) -> Manifold:
     """One contact, at the closest point; a centre inside is pushed out through the nearest face."""
     pair, out = np.empty(len(delta), np.int64), np.empty((len(delta), 7))
-    found = _spheres(*body.hulls[2:], *ball, *body.columns(), delta, pair, out)
+    found = _spheres(*body.hulls[3:-1], *ball, *body.columns(), delta, pair, out)
     return _manifold(pair[:found], np.zeros(found, np.int64), out[:found])
 
 
@@ -182,6 +199,16 @@ def _place(count, vertex, normal, corner, turn, scale, x, y, z, points, normals,
 
 
 @loop
+def _within(many, points, inset, turn, skin, out):
+    """Fill in where the vertices of a polyhedron are when its faces move in by the depth of its skin."""
+    for k in range(many):
+        for n in range(3):
+            out[k, n] = points[k, n]
+            for i in range(3):
+                out[k, n] += skin * turn[n, i] * inset[k, i]
+
+
+@loop
 def _beyond(faces, normals, level, points, many, reach, tie, best, face):
     """The face whose plane is furthest from the points on its outer side, and how far that is, if it is more than
     `best`; else `best` and `face`. Ends early where it is more than the reach."""
@@ -198,6 +225,21 @@ def _beyond(faces, normals, level, points, many, reach, tie, best, face):
 
 
 @loop
+def _rounded(faces, normals, level, points, many, axis, sign, apart):
+    """The greatest of the gaps along the normals of faces, each wider by what the normal is off the axis (`sign` -1:
+    off its reverse) of polyhedra that are so far apart without their skins."""
+    best = -np.inf
+    for f in range(faces):
+        u, v, w = normals[f, 0], normals[f, 1], normals[f, 2]
+        least = np.inf
+        for k in range(many):
+            least = min(least, u * points[k, 0] + v * points[k, 1] + w * points[k, 2])
+        off = 1.0 - sign * (u * axis[0] + v * axis[1] + w * axis[2])
+        best = max(best, least - level[f] + apart * off)
+    return best
+
+
+@loop
 def _slopes(edges, edge, points, faces, normals, out):
     """Fill in the scalar products of the edges with normals of the other polyhedron."""
     for e in range(edges):
@@ -208,9 +250,13 @@ def _slopes(edges, edge, points, faces, normals, out):
 
 
 @loop
-def _crossing(edges, edge, wing, p, p_normal, p_slope, others, other_edge, other_wing, q, q_slope, tie, axis):
+def _crossing(edges, edge, wing, p, p_normal, other_faces, others, other_edge, other_wing, q, q_normal, faces, slopes,
+              tie, axis):  # fmt: skip
     """The two edges along whose common normal the polyhedra are furthest apart, and how far: two edges whose normals
     cross on the sphere make a face of the difference of the two. Fills in the normal, the axis."""
+    p_slope, q_slope = slopes[0], slopes[1]
+    _slopes(edges, edge, p, other_faces, q_normal, p_slope)
+    _slopes(others, other_edge, q, faces, p_normal, q_slope)
     best, one, two = -np.inf, -1, -1
     for e in range(edges):
         left, right = wing[e, 0], wing[e, 1]
@@ -347,6 +393,18 @@ def _crossings(many, flat, beyond, others, other, other_beyond, thick, most, spo
 
 
 @loop
+def _well_inside(spots, many, corner, line, margin):
+    """Whether the middle of places is further than the margin inside the lines of a polygon."""
+    x, y, n, inside = 0.0, 0.0, 0, True
+    for k in range(many):
+        x, y = x + spots[k, 0] / many, y + spots[k, 1] / many
+    while n < len(corner) and corner[n] >= 0:
+        inside &= line[n, 0] * x + line[n, 1] * y - line[n, 2] <= -margin
+        n += 1
+    return inside
+
+
+@loop
 def _overlaid(corners, p, normal, other_corners, q, other_normal, frame, thick, most, flat, line, plane, beyond,
               spots, code):  # fmt: skip
     """The corners of the polygon that is common to two faces, seen along the third axis of the frame: how many corners
@@ -458,19 +516,56 @@ def _distance(p, many, q, others, x, y, z, reach, size, way, ends, share, parts)
 
 @loop
 def _witness(points, ends, share, count, place):
-    """Fill in the point of a polyhedron that has these shares of vertices; the vertex of the greatest share, and
-    another one, -1 if there is none."""
+    """Fill in the point of a polyhedron that has these shares of vertices."""
     place[0], place[1], place[2] = 0.0, 0.0, 0.0
-    one, two, most = -1, -1, 0.0
     for k in range(count):
         for n in range(3):
             place[n] += share[k] * points[ends[k], n]
+
+
+@loop
+def _surface(points, ends, share, count, core, axis, skin, place):
+    """Fill in the place of a polyhedron outside of a place `core` of it without its skin, which has these shares of
+    vertices; the vertex of the greatest share, and another one, -1 if there is none. The axis looks outward."""
+    one, two, three, most = -1, -1, -1, 0.0
+    for k in range(count):
         if share[k] > most:
             one, most = ends[k], share[k]
     for k in range(count):
         if ends[k] != one:
             two = ends[k]
+    for k in range(count):
+        if ends[k] != one and ends[k] != two:
+            three = ends[k]
+    if three >= 0:
+        for n in range(3):
+            place[n] = core[n] + skin * axis[n]
+    else:
+        _foot(points[one], points[two if two >= 0 else one], core, place)
     return one, two
+
+
+@loop
+def _foot(a, b, point, place):
+    """Fill in the point of the line from a to b that is closest to a point, between the two."""
+    u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    square = u * u + v * v + w * w
+    t = (point[0] - a[0]) * u + (point[1] - a[1]) * v + (point[2] - a[2]) * w
+    t = min(max(t / square, 0.0), 1.0) if square > 0.0 else 0.0
+    place[0], place[1], place[2] = a[0] + t * u, a[1] + t * v, a[2] + t * w
+
+
+@loop
+def _parts(p, many, q, others, place, distance):
+    """Whether the way between two places, of that length, is one across which polyhedra are apart, and not within
+    both."""
+    x, y, z = place[1, 0] - place[0, 0], place[1, 1] - place[0, 1], place[1, 2] - place[0, 2]
+    most, least = -np.inf, np.inf
+    for k in range(many):
+        most = max(most, x * p[k, 0] + y * p[k, 1] + z * p[k, 2])
+    for k in range(others):
+        least = min(least, x * q[k, 0] + y * q[k, 1] + z * q[k, 2])
+    return least - most > 0.5 * distance * distance
 
 
 @loop
@@ -483,10 +578,12 @@ def _edge_of(edges, edge, one, two):
 
 
 @loop
-def _on_edges(points, many, others, count, edges, edge, axis, sign, slack, most, first, found, out, feature):
+def _on_edges(points, many, others, count, edges, edge, axis, sign, slack, most, end, skin, other_skin, first, found,
+              out, feature):  # fmt: skip
     """Add the vertices of a polyhedron, of those that are foremost along the axis (`sign` -1: against it) within the
     slack, that are at most `most` from edges of the other one, which has such vertices too; the new number of contacts,
-    and the least distance. `first` is the number of the first vertex among the features."""
+    and the least distance; not those beside an end of an edge, by more than `end`. Their places are those of the polyhedra with their skins. `first` is the number of the first
+    vertex among the features."""
     front, back, least = -np.inf, np.inf, np.inf
     for k in range(many):
         front = max(front, sign * dot(axis, points[k]))
@@ -495,7 +592,7 @@ def _on_edges(points, many, others, count, edges, edge, axis, sign, slack, most,
     for k in range(many):
         if sign * dot(axis, points[k]) < front - slack:
             continue
-        best, x, y, z = np.inf, 0.0, 0.0, 0.0
+        best, x, y, z, one, two, corner = np.inf, 0.0, 0.0, 0.0, 0, 0, False
         for e in range(edges):
             a, b = edge[e, 0], edge[e, 1]
             if min(sign * dot(axis, others[a]), sign * dot(axis, others[b])) > back + slack:
@@ -506,12 +603,20 @@ def _on_edges(points, many, others, count, edges, edge, axis, sign, slack, most,
             i, j, s = t * u - i, t * v - j, t * w - s
             square = i * i + j * j + s * s
             if square < best:
-                best, x, y, z = square, i, j, s
+                best, x, y, z, one, two, corner = square, i, j, s, a, b, t == 0.0 or t == 1.0
         gap = np.sqrt(best)
+        if corner:  # on a corner, along the axis, or beside it
+            ahead = axis[0] * x + axis[1] * y + axis[2] * z
+            if best - ahead * ahead > end * end:
+                continue
+            gap, x, y, z = abs(ahead), ahead * axis[0], ahead * axis[1], ahead * axis[2]
         if gap <= most:
             least = min(least, gap)
-            per, i, j, s = sign / gap, points[k, 0] + 0.5 * x, points[k, 1] + 0.5 * y, points[k, 2] + 0.5 * z
-            _set(out, found, i, j, s, x * per, y * per, z * per, gap)
+            per = sign / gap
+            _set(out, found, 0.0, 0.0, 0.0, x * per, y * per, z * per, gap)
+            _foot(other_skin[one], other_skin[two], skin[k], out[found])
+            for n in range(3):
+                out[found, n] = 0.5 * (out[found, n] + skin[k, n])
             feature[found] = first + k
             found += 1
     return found, least
@@ -531,8 +636,8 @@ def _frame(normal, sign, one, other, frame):
 
 @loop
 def _pairs(
-    count, vertex, normal, corner, side, edge, wing, center, turn, scale, hull, other_center, other_turn, other_scale,
-    other_hull, delta, most, done, found, pair, feature, out,
+    sharp, count, vertex, normal, corner, side, edge, wing, inset, center, turn, scale, hull, other_center, other_turn,
+    other_scale, other_hull, delta, most, done, found, pair, feature, out,
 ):  # fmt: skip
     """Add to the first contacts those of the pairs that are not done, as long as there is room for the `most` that a
     pair has; new numbers of pairs done and contacts found."""
@@ -542,6 +647,7 @@ def _pairs(
     flat, line, plane, beyond = np.empty((2, s, 3)), np.empty((2, s, 3)), np.empty((2, 3)), np.empty((2, s, s))
     spots, code = np.empty((4 * s, 4)), np.empty(4 * s, np.int64)
     way, ends, share, parts = np.empty((4, 3)), np.empty((4, 2), np.int64), np.empty(4), np.empty(6)
+    cores, core_place = np.empty((2, v, 3)), np.empty((2, 3))
     p, q, p_normal, q_normal = points[0], points[1], normals[0], normals[1]
     for m in range(done, len(hull)):
         if found + most > len(out):
@@ -562,18 +668,18 @@ def _pairs(
         if flush > reach:
             continue
 
-        # Where faces part the two, the edges matter only if these are as close as touching.
+        # Where faces part the two, the edges matter only if no face is clearly the nearest.
         crossed, one_edge, other_edge = -np.inf, -1, -1
         if flush <= CLOSE * size:
-            _slopes(many[2], edge[g], p, others[1], q_normal, slopes[0])
-            _slopes(others[2], edge[h], q, many[1], p_normal, slopes[1])
             crossed, one_edge, other_edge = _crossing(
-                many[2], edge[g], wing[g], p, p_normal, slopes[0], others[2], edge[h], wing[h], q, slopes[1], tie, axis
-            )
-        apart = max(flush, crossed)
+                many[2], edge[g], wing[g], p, p_normal, others[1], others[2], edge[h], wing[h], q, q_normal, many[1],
+                slopes, tie, axis,
+            )  # fmt: skip
+        apart, laid = max(flush, crossed), 0
         if apart > reach:
             continue
 
+        # What is well within a face has its normal.
         if flush >= apart - tolerance:
             if other < 0:
                 _frame(p_normal[one], 1.0, p[corner[g, one, 0]], p[corner[g, one, 1]], frame)
@@ -587,46 +693,73 @@ def _pairs(
                 line, plane, beyond, spots, code,
             )  # fmt: skip
             if least <= apart + tolerance:
-                for k in range(of_first + of_second + of_both):
+                laid = of_first + of_second + of_both
+                for k in range(laid):
                     if k < of_first:
-                        feature[found] = corner[g, one, code[k]]
+                        feature[found + k] = corner[g, one, code[k]]
                     elif k < of_first + of_second:
-                        feature[found] = v + corner[h, last, code[k]]
+                        feature[found + k] = v + corner[h, last, code[k]]
                     else:
-                        feature[found] = 2 * v + e * side[g, one, code[k] // s] + side[h, last, code[k] % s]
-                    pair[found], out[found, 6] = m, spots[k, 3]
+                        feature[found + k] = 2 * v + e * side[g, one, code[k] // s] + side[h, last, code[k] % s]
+                    out[found + k, 6] = spots[k, 3]
                     for n in range(3):
-                        out[found, n] = center[m, n]
+                        out[found + k, n], out[found + k, 3 + n] = center[m, n], frame[2, n]
                         for i in range(3):
-                            out[found, n] += spots[k, i] * frame[i, n]
-                        out[found, 3 + n] = frame[2, n]
-                    found += 1
-                continue
+                            out[found + k, n] += spots[k, i] * frame[i, n]
+                sides = line[0] if other < 0 else line[1]
+                corners = corner[g, one] if other < 0 else corner[h, last]
+                inside = _well_inside(spots, laid, corners, sides, ROUND * size * (sharp[g] + sharp[h]))
+                if laid == 0 or inside:
+                    for k in range(found, found + laid):
+                        pair[k] = m
+                    found += laid
+                    continue
 
-        gap = apart
-        if apart > tie:
-            extent = np.sqrt(x * x + y * y + z * z)
-            points_in, gap = _distance(p, many[0], q, others[0], x, y, z, reach, extent, way, ends, share, parts)
+        # Else the direction is that of the closest points where edges and corners are round.
+        if flush > CLOSE * size:
+            crossed, one_edge, other_edge = _crossing(
+                many[2], edge[g], wing[g], p, p_normal, others[1], others[2], edge[h], wing[h], q, q_normal, many[1],
+                slopes, tie, axis,
+            )  # fmt: skip
+        skin = ROUND * size
+        _within(many[0], p, inset[g], turn[m], skin, cores[0])
+        _within(others[0], q, inset[h], other_turn[m], skin, cores[1])
+        extent, more = np.sqrt(x * x + y * y + z * z), skin * (sharp[g] + sharp[h])
+        points_in, core_gap = _distance(
+            cores[0], many[0], cores[1], others[0], x, y, z, reach + more, extent, way, ends, share, parts
+        )
+        if core_gap == np.inf:
+            continue
+        for t in range(2):
+            _witness(cores[t], ends[:, t], share, points_in, core_place[t])
+        if core_gap > CLOSE * size and _parts(cores[0], many[0], cores[1], others[0], core_place, core_gap):
+            crossing = axis[0], axis[1], axis[2]
+            for t in range(3):
+                axis[t] = (core_place[1, t] - core_place[0, t]) / core_gap
+            i, k = _surface(p, ends[:, 0], share, points_in, core_place[0], axis, skin, place[0])
+            j, n = _surface(q, ends[:, 1], share, points_in, core_place[1], axis, -skin, place[1])
+            if laid > 0 and dot(axis, frame[2]) > 1.0 - PARALLEL:
+                for t in range(found, found + laid):
+                    pair[t] = m
+                found += laid
+                continue
+            gap = crossed + core_gap * (1.0 - dot(axis, crossing))
+            gap = max(gap, _rounded(many[1], p_normal, level[0], q, others[0], axis, 1.0, core_gap))
+            gap = max(gap, _rounded(others[1], q_normal, level[1], p, many[0], axis, -1.0, core_gap))
             if gap > reach:
                 continue
-        if gap > CLOSE * size:
-            i, k = _witness(p, ends[:, 0], share, points_in, place[0])
-            j, n = _witness(q, ends[:, 1], share, points_in, place[1])
-            for t in range(3):
-                axis[t] = place[1, t] - place[0, t]
-            gap = np.sqrt(dot(axis, axis))
-            for t in range(3):
-                axis[t] /= gap
-            far = min(gap + tolerance, reach)
+            far = core_gap + min(tolerance, reach - gap)
             found, least = _on_edges(
-                p, many[0], q, others[0], others[2], edge[h], axis, 1.0, tolerance, far, 0, found, out, feature
-            )
+                cores[0], many[0], cores[1], others[0], others[2], edge[h], axis, 1.0, tolerance, far, skin, p, q, 0,
+                found, out, feature,
+            )  # fmt: skip
             own = found
             found, lesser = _on_edges(
-                q, others[0], p, many[0], many[2], edge[g], axis, -1.0, tolerance, far, v, found, out, feature
-            )
-            found = _each_once(out, feature, start, own, found, 1e-6 * size)
-            if gap < min(least, lesser) - tie:
+                cores[1], others[0], cores[0], many[0], many[2], edge[g], axis, -1.0, tolerance, far, skin, q, p, v,
+                found, out, feature,
+            )  # fmt: skip
+            found = _each_once(out, feature, start, own, found, 2.0 * skin)
+            if core_gap < min(least, lesser) - tie:
                 one_edge, other_edge = _edge_of(many[2], edge[g], i, k), _edge_of(others[2], edge[h], j, n)
                 name = i
                 if k >= 0 and n < 0:
@@ -639,8 +772,15 @@ def _pairs(
                 feature[at], found = name, max(found, at + 1)
                 _set(
                     out, at, 0.5 * (place[0, 0] + place[1, 0]), 0.5 * (place[0, 1] + place[1, 1]),
-                    0.5 * (place[0, 2] + place[1, 2]), axis[0], axis[1], axis[2], gap,
+                    0.5 * (place[0, 2] + place[1, 2]), axis[0], axis[1], axis[2], core_gap,
                 )  # fmt: skip
+            for k in range(start, found):
+                out[k, 6] += gap - core_gap
+        elif laid > 0:
+            for k in range(found, found + laid):
+                pair[k] = m
+            found += laid
+            continue
         elif one_edge >= 0 and crossed >= flush - tolerance:
             _between(
                 p[edge[g, one_edge, 0]], p[edge[g, one_edge, 1]], q[edge[h, other_edge, 0]], q[edge[h, other_edge, 1]],

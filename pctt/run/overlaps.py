@@ -7,7 +7,7 @@ import math
 from dem.overlaps import overlaps
 from dem.scene import Scene
 from dem.step import Step
-from dem.stiffness import expected_overlap
+from dem.stiffness import OVERLAP, expected_overlap
 from dem.time_step import DRIVEN, smallest
 from pctt.run.report import mending
 from pctt.run.settings import CLOSING, Settings
@@ -41,8 +41,8 @@ class OverlapWatch:
         self._told: set[str] = set()
 
     def look(self, step: Step, closing_speed: float) -> str:
-        """The field of `Settings` that helps, if a step shows more than TWICE of what is promised and it was not told
-        yet; the same on all ranks; collective."""
+        """The field of `Settings` that helps, if a step shows more than TWICE of what is promised (and of OVERLAP, what
+        scenes have by default) and it was not told yet; the same on all ranks; collective."""
         found, held = overlaps(step)
         if self._start is None:
             self._start = found
@@ -52,7 +52,7 @@ class OverlapWatch:
         if found > self._worst:
             self._worst, self.cause = found, cause
         promised = self.springs + (0.0 if cause == "stiffness" else self.steps)
-        if found <= max(TWICE * promised, self._start) or cause in self._told:
+        if found <= max(TWICE * max(promised, OVERLAP), self._start) or cause in self._told:
             return ""
         self._told.add(cause)
         return cause

@@ -30,8 +30,10 @@ NOT_THE_LAW = (
     "relaxation, or leave out -ksp_type, -pc_type and -ccp_newton contact"
 )
 
-#: What helps against jumps of energy; a smaller tolerance does not.
-JUMP_ADVICE = "What helps: a smaller -dt, a -stiffness, or a tool of bounded force or torque (docs/mechanics.md)"
+def jump_advice(program: bool) -> str:
+    """What helps against jumps of energy; a smaller tolerance does not."""
+    dt, stiffness = (option_name(field, program) for field in ("dt", "stiffness"))
+    return f"What helps: a smaller {dt}, a {stiffness}, or a tool of bounded force or torque (docs/mechanics.md)"
 
 
 def residual(line: Mapping[str, Any]) -> float:
@@ -106,11 +108,13 @@ def _shortfall(line: Mapping[str, Any]) -> str:
     return f"NOT CONVERGED: {residuals}: {line['reason']}"
 
 
-def jump_words(line: Mapping[str, Any]) -> str:
-    """What is said at once of a step with a jump of energy."""
+def jump_words(line: Mapping[str, Any], program: bool) -> str:
+    """What is said at once of the first step with a jump of energy; the program has other names of options than
+    Python."""
     return (
         f"step {line['step']}: the kinetic energy rises by {line['energy_jump']:.3g} J to"
-        f" {line['kinetic_energy [J]']:.3g} J, tenfold or out of nothing. {JUMP_ADVICE}"
+        f" {line['kinetic_energy [J]']:.3g} J, tenfold or out of nothing. {jump_advice(program)}. Later "
+        "jumps are in the figure energy_jump of their steps"
     )
 
 
@@ -231,7 +235,7 @@ def jumps_line(steps: Sequence[Mapping[str, Any]]) -> str:
         return ""
     worst = max(jumps, key=lambda line: line["energy_jump"])
     said = f"WARNING: {len(jumps)} jumps of energy, the largest of {worst['energy_jump']:.3g} J in step {worst['step']}"
-    return f"{said}; means are without these steps. {JUMP_ADVICE}"
+    return f"{said}; means are without these steps. {jump_advice(True)}"
 
 
 def forces_line(steps: Sequence[Mapping[str, Any]], limit: float) -> str:

@@ -26,7 +26,7 @@ import numpy as np
 from dem.experiment import Experiment, option
 from dem.measures import Block
 from dem.mesh import Mesh
-from dem.motion import Rotation
+from dem.motion import Dynamic, Rotation
 from dem.packing import random_packing
 from dem.scene import Scene
 from dem.shapes import Plane, Sphere
@@ -68,7 +68,7 @@ class Plant(Experiment):
         scene.add_body("paddle", [blade], motion=Rotation((0.0, 0.0, 4.0)))
         chain = [f"bead {k}" for k in range(3)]
         for k, name in enumerate(chain):
-            scene.add_body(name, [Sphere(r)], position=(-width, 5 * r, 8 * r - 2.1 * r * k), density=2500.0)
+            scene.add_body(name, [Sphere(r)], Dynamic(), position=(-width, 5 * r, 8 * r - 2.1 * r * k), density=2500.0)
         scene.add_joint("motor", None, chain[0], anchor=(-width, 5 * r, 9 * r), axis=(0, 1, 0), speed=1.0, strength=0.1)
         for k in range(2):
             anchor = (-width, 5 * r, 6.95 * r - 2.1 * r * k)

@@ -128,7 +128,7 @@ def test_the_recommended_stiffness_holds_the_bed_and_the_tool():
     scene = column(None, count=20)
     stiffness = recommended(scene)
     assert pairs(scene).stiffness.tolist() == [[stiffness]]
-    assert expected_overlap(scene, stiffness) == pytest.approx(0.003, rel=0.05)
+    assert expected_overlap(scene, stiffness, 0.01) == pytest.approx(0.003, rel=0.05)
     assert stiffness == pytest.approx(4 * 20 * MASS * G / (0.003 * R), rel=0.05)
     with pctt.Simulation(scene, dt=0.01, solver="apgd", **EXACT) as sim:
         sim.run(steps=100)
@@ -143,7 +143,7 @@ def test_the_recommended_stiffness_holds_the_bed_and_the_tool():
     bed = column(None, count=20)
     bed.add_body("tool", [Box((1.0, 1.0, 1.0))], Glide((0, 3.0, 0)), position=(0, 5, 0))
     assert recommended(bed) == pytest.approx(RESISTS * stiffness, rel=0.05)  # a bed gives way before a chain does
-    assert expected_overlap(bed, recommended(bed)) == pytest.approx(0.003, rel=0.05)
+    assert expected_overlap(bed, recommended(bed), 0.01) == pytest.approx(0.003, rel=0.05)
     alone = column(None, count=1)
     alone.add_body("tool", [Box((1.0, 1.0, 1.0))], Glide((0, 30.0, 0)), position=(0, 5, 0))
     assert recommended(alone) == pytest.approx(MASS * (STOPPED * 30.0 / (0.003 * R)) ** 2, rel=0.05)
