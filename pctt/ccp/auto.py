@@ -8,10 +8,11 @@ one that is easy costs nothing more.
 For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path.
 
-Small problems are the exception: there it goes on to the end, and to an aim beyond the limits. Where friction is large, from 2 on, both may fail: APGD
-circles about the law, and the path of the conic method ends at a wall of its cones. So plain projected steps, which do
-not circle, and the conic method with shorter steps take turns, and at last there are cone problems for given De Saxce
-terms (`pctt.ccp.coulomb`). Where the relaxation has no solution, nothing says that Coulomb's law has one.
+Small problems are the exception: there it goes on to the end, and to an aim beyond the limits. Where friction is
+large, from 2 on, both may fail: APGD circles about the law, and the path of the conic method ends at a wall of its
+cones. So plain projected steps, which do not circle, and the conic method with shorter steps take turns, and at last
+there are cone problems for given De Saxce terms (`pctt.ccp.coulomb`). Where the relaxation has no solution, nothing
+says that Coulomb's law has one.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from functools import partial
 
 import numpy as np
 
-from pctt.ccp.cone import Array
 from pctt.ccp import gathered
+from pctt.ccp.cone import Array
 from pctt.ccp.coulomb import Coulomb, fixed_point
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic

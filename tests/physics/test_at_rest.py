@@ -1,4 +1,4 @@
-"""Bodies at rest by the defaults: the floor bears their weight in every step, nothing creeps, and no step costs more."""
+"""Bodies at rest by the defaults: the floor bears their weight in every step, nothing creeps, iterations are few."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import warnings
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 import pctt
 from dem import record as recording
