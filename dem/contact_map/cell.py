@@ -36,7 +36,7 @@ class CellMap(ContactMap):
     free : the map without the cell; it may have rows of turning, which the cell does not touch
     """
 
-    coupled = True
+    couples = True
 
     def __init__(self, free: ContactMap, cell: Cell):
         self.comm, self.given, self.halo, self.body = free.comm, free.given, free.halo, free.body

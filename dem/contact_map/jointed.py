@@ -8,7 +8,6 @@ of joints have no sign and need no cone; what is left is the same cone problem o
 from __future__ import annotations
 
 import copy
-
 from functools import cached_property
 
 import numpy as np
@@ -30,7 +29,7 @@ class JointedMap(ContactMap):
     free : the map without joints, perhaps with moments
     """
 
-    coupled = True
+    couples = True
 
     def __init__(self, known: ContactMap, here: Ints, slot: Ints, coupling: Floats):
         super().__init__(known.comm, known.given, known.halo, known.body, known.precision)

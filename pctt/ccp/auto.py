@@ -32,6 +32,7 @@ from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.options import number
 
+USUAL = apgd.APGD()
 PLAIN = apgd.APGD(damping=1.0, near=1.0)  # without momentum
 SHORT = conic.Conic(start=1.0, boundary_with_law=0.5)
 TERMS = Coulomb(max_it=60, depth=2)
@@ -69,11 +70,12 @@ def solve(
             settings = conic.Conic()
             tried.conic(first.impulse, replace(settings, start=min(settings.start, options.start * first.residual)))
         else:
-            second = tried.conic(guess, conic.Conic(), 0.0 if small else max(limits.tol, options.basin))
-            if not small or second.status is Status.GIVEN_UP:
+            basin = max(limits.tol, options.basin)
+            second = tried.conic(guess, conic.Conic(), 0.0 if small else basin)
+            if small and second.status is not Status.GIVEN_UP and second.residual > basin:
+                tried.in_turns(options, basin)
+            elif not (small and second.final):
                 tried.apgd(second.impulse if second.iterations else first.impulse, limits.max_it)
-            elif not second.final:
-                tried.in_turns(options)
     return tried.result()
 
 
@@ -90,7 +92,7 @@ class Attempts:
         self.all.append(result)
         return result
 
-    def apgd(self, guess: Array, most: int, options: apgd.APGD = apgd.APGD()) -> Result:
+    def apgd(self, guess: Array, most: int, options: apgd.APGD = USUAL) -> Result:
         limits = replace(self.limits, max_it=min(most, self.limits.max_it))
         return self.keep(apgd.solve(self.problem, guess, limits, options, coulomb=self.coulomb), "apgd")
 
@@ -106,10 +108,14 @@ class Attempts:
     def best(self) -> Result:
         return min(self.all, key=lambda result: result.residual)
 
-    def in_turns(self, options: Auto) -> None:
-        """Plain steps and shorter ones of the conic method; then the relaxation, and cone problems that begin there."""
+    def in_turns(self, options: Auto, basin: float) -> None:
+        """Plain steps and shorter ones of the conic method, until APGD can go on; where they do not come so far the
+        relaxation, and cone problems that begin there."""
         for _ in range(options.turns):
             if self.apgd(self.best.impulse, options.plain, PLAIN).final or self.conic(self.best.impulse, SHORT).final:
+                return
+            if self.best.residual <= basin:
+                self.apgd(self.best.impulse, self.limits.max_it)
                 return
         problem = self.problem
         by_conic = partial(conic.solve, problem, options=conic.Conic(), newton=self.newton)

@@ -202,7 +202,7 @@ class ConeProblem:
     def by_rows(self) -> ConeProblem:
         """The same problem with the rows of its map as they are, if more than contacts couples its bodies; it shares
         all arrays, and has the same residuals. Collective."""
-        if self.contact_map is None or not self.contact_map.coupled:
+        if self.contact_map is None or not self.contact_map.couples:
             return self
         other = copy.copy(self)
         for name in ("_rigid_blocks", "diagonal", "diagonal_blocks", "_split", "N"):  # those of its map are estimates

@@ -344,8 +344,7 @@ def simulated(seed: int, steps: int) -> Row:
     with sim:
         before = momentum(sim)
         try:
-            for _ in range(steps):
-                lines.append(sim.step())
+            lines.extend(sim.step() for _ in range(steps))
         except Exception as error:  # whatever it is, it is a note
             notes.append(end_of(made, error))
         notes += [*solves(made, lines), *overlaps(made, sim, lines), *energies(made, lines), *places(made, sim)]
