@@ -36,6 +36,7 @@ USUAL = apgd.APGD()
 PLAIN = apgd.APGD(damping=1.0, near=1.0)  # without momentum
 SHORT = conic.Conic(start=1.0, boundary_with_law=0.5)
 TERMS = Coulomb(max_it=60, depth=2)
+GROWN = 1e9  # of the impulses that the data suggest: no mass ratio that is solved asks for as much
 
 
 @dataclass(frozen=True)
@@ -85,10 +86,19 @@ class Attempts:
     def __init__(self, problem: ConeProblem, limits: Limits, newton: Newton, coulomb: bool):
         self.problem, self.limits, self.newton, self.coulomb = problem, limits, newton, coulomb
         self.all: list[Result] = []
+        self.usual = problem.norm(problem.r) / problem.mean_diagonal  # the size of impulses that the data suggest
         self.most = min(60, limits.max_it)  # iterations of the conic method
 
     def keep(self, result: Result, solver: str) -> Result:
+        """Note a result. Impulses of self-stress may grow in Coulomb's law until their rounding throws bodies away, and
+        the natural residual, which is relative to them, falls: such impulses are none."""
         result.solver, result.newton_its = solver, result.iterations if solver == "conic" else 0
+        if self.coulomb and self.problem.norm(result.impulse) > GROWN * self.usual:
+            if why := why_unbounded(self.problem, result.impulse):
+                result.status, result.reason = Status.UNBOUNDED, why
+            else:
+                result.status, result.residual = Status.STALLED, np.inf
+                result.impulse = np.zeros_like(result.impulse)
         self.all.append(result)
         return result
 
@@ -124,8 +134,11 @@ class Attempts:
         if why := why_unbounded(problem, relaxed.impulse):
             self.keep(replace(relaxed, status=Status.UNBOUNDED, reason=f"of the relaxation, {why}"), "conic")
             return
-        terms = fixed_point(lambda g, limits: by_conic(guess=g, limits=limits), problem, relaxed.impulse, limits, TERMS)
-        self.keep(terms.after(relaxed), "conic").exhausted = True
+        last = relaxed = replace(relaxed, status=Status.STALLED, residual=np.inf, reason="relaxation")
+        if len(problem.r) == problem.cones.count:  # without moments, whose terms it does not have
+            last = fixed_point(lambda g, to: by_conic(guess=g, limits=to), problem, relaxed.impulse, limits, TERMS)
+            last.after(relaxed)
+        self.keep(last, "conic").exhausted = True
 
     def result(self) -> Result:
         """The last one, or, where nothing is left to try and it is not final, the best; with what all have cost."""
