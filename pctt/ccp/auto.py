@@ -49,7 +49,7 @@ class Auto:
     start: float = number(3e4, "complementarity of the conic method's start, at most, by APGD's residual")
     basin: float = number(3e-4, "Coulomb residual at which the conic method's path is near enough for APGD")
     turns: int = number(4, "of plain steps and the conic method, where it fails in a small problem of Coulomb's law")
-    plain: int = number(100, "plain steps in each of them")
+    plain: int = number(100, "plain steps in the first of them; twice as many in each other one")
 
     def iterations(self, contacts: int, tol: float, coulomb: bool, few: bool = False) -> int:
         """Those of APGD. Small problems have fixed costs; where they are ``few`` those of both methods are calls."""
@@ -121,8 +121,9 @@ class Attempts:
     def in_turns(self, options: Auto, basin: float) -> None:
         """Plain steps and shorter ones of the conic method, until APGD can go on; where they do not come so far the
         relaxation, and cone problems that begin there."""
-        for _ in range(options.turns):
-            if self.apgd(self.best.impulse, options.plain, PLAIN).final or self.conic(self.best.impulse, SHORT).final:
+        for turn in range(options.turns):
+            most = options.plain * 2**turn
+            if self.apgd(self.best.impulse, most, PLAIN).final or self.conic(self.best.impulse, SHORT).final:
                 return
             if self.best.residual <= basin:
                 self.apgd(self.best.impulse, self.limits.max_it)
