@@ -113,3 +113,45 @@ def test_the_ranks_of_unfoldings_are_those_of_the_train_that_svd_makes(monkeypat
         assert ranks.rank_at(values, eps) == decompose_matrix(A, [4, 6], eps=eps).ranks[1]
     left = np.linalg.norm(A - decompose_matrix(A, [4, 6], max_rank=2, eps=0).full()) / np.linalg.norm(A)
     assert ranks.captured(values, 2) == pytest.approx(1 - left**2)
+
+
+def random_scenes(monkeypatch):
+    monkeypatch.syspath_prepend(STUDIES)
+    return __import__("random_scenes")
+
+
+def test_notes_of_random_scenes_tell_faults_from_what_is_known(monkeypatch):
+    """Steps that are not solved, deep overlaps, energy from nothing, and ends of runs."""
+    study = random_scenes(monkeypatch)
+    scene = study.mixture(0).scene
+    bare, pressed = study.Mixture(scene, 0.1, []), study.Mixture(scene, 0.1, [], rigid=True, pressed=True)
+    figures = {"step": 1, "status": "converged", "coulomb_residual": 1e-4, "tolerance": 5e-4, "iterations": 3}
+    assert study.solves(bare, [figures]) == []
+    wrongs = {"status": "stalled"}, {"coulomb_residual": 6e-4}, {"coulomb_residual": np.nan}, {"iterations": 20_000}
+    for wrong in wrongs:
+        (note,) = study.solves(bare, [figures, figures | wrong])
+        assert not note.reason
+    assert study.overlaps(bare, None, [{"worst_overlap": 1e-4}]) == []
+    assert [bool(study.overlaps(made, None, [{"worst_overlap": 0.02}])[0].reason) for made in (bare, pressed)] == [0, 1]
+    energies = [dict(zip(study.STATES, values)) for values in ([3.0, 1.0, 0.0], [2.0, 1.5, 0.0], [2.5, 1.5, 0.0])]
+    assert study.energies(bare, energies[:2]) == []
+    assert "energy from nothing" in study.energies(bare, energies)[0].fault
+    fast = study.SceneError("grain 1 moves at 8 m/s, too far in a time step of 0.1 s")
+    assert [bool(study.end_of(bare, speed, fast).reason) for speed in (5.0, 0.1)] == [True, False]
+    unbounded = study.SceneError("step 3: unbounded: impulses grow")
+    assert [bool(study.end_of(made, 1.0, unbounded).reason) for made in (bare, pressed)] == [False, True]
+    assert not study.end_of(bare, 1.0, IndexError("out of range")).reason
+
+
+def test_a_random_scene_is_that_of_its_seed(monkeypatch):
+    study = random_scenes(monkeypatch)
+    one, two = (study.simulated(6, 3) for _ in range(2))
+    assert one == two
+    assert (one["steps"], one["solved"], one["notes"]) == (3, 3, [])
+
+
+@pytest.mark.slow
+def test_random_scenes_have_no_fault_without_a_reason(tmp_path):
+    words = [sys.executable, STUDIES / "random_scenes.py", "104", "24"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr

@@ -89,8 +89,8 @@ def solve(
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
     result = asked = _by(type, problem, _start(problem, guess), limits, options, newton, law)
     other = "conic" if asked.solver == "apgd" else "apgd"
-    no_numbers = asked.status is Status.BREAKDOWN and other == "conic"  # products are none
-    hopeless = asked.final or asked.exhausted or no_numbers
+    wrong = asked.status is Status.BREAKDOWN and other == "conic"  # products are no numbers
+    hopeless = asked.final or asked.exhausted or wrong
     if limits.fallback and not hopeless:
         second = _by(other, problem, asked.impulse, dataclasses.replace(limits, max_it=-1), None, newton, law)
         better = second.final or second.residual < asked.residual

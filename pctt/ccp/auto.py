@@ -34,9 +34,11 @@ from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.options import number
 
+USUAL = apgd.APGD()
 PLAIN = apgd.APGD(damping=1.0, near=1.0)  # without momentum
 SHORT = conic.Conic(start=1.0, boundary_with_law=0.5)
 TERMS = Coulomb(max_it=60, depth=2)
+GROWN = 1e9  # of the impulses that the data suggest: no mass ratio that is solved asks for as much
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Auto:
     start: float = number(3e4, "complementarity of the conic method's start, at most, by APGD's residual")
     basin: float = number(3e-4, "Coulomb residual at which the conic method's path is near enough for APGD")
     turns: int = number(4, "of plain steps and the conic method, where it fails in a small problem of Coulomb's law")
-    plain: int = number(100, "plain steps in each of them")
+    plain: int = number(100, "plain steps in the first of them; twice as many in each other one")
 
     def iterations(self, contacts: int, tol: float, coulomb: bool, few: bool = False) -> int:
         """Those of APGD. Small problems have fixed costs; where they are ``few`` those of both methods are calls."""
@@ -73,11 +75,12 @@ def solve(
             settings = conic.Conic()
             tried.conic(first.impulse, replace(settings, start=min(settings.start, options.start * first.residual)))
         else:
-            second = tried.conic(guess, conic.Conic(), 0.0 if small else max(limits.tol, options.basin))
-            if not small or second.status is Status.GIVEN_UP:
+            basin = max(limits.tol, options.basin)
+            second = tried.conic(guess, conic.Conic(), 0.0 if small else basin)
+            if small and second.status is not Status.GIVEN_UP and second.residual > basin:
+                tried.in_turns(options, basin)
+            elif not (small and second.final):
                 tried.apgd(second.impulse if second.iterations else first.impulse, limits.max_it)
-            elif not second.final:
-                tried.in_turns(options)
     return tried.result()
 
 
@@ -87,14 +90,23 @@ class Attempts:
     def __init__(self, problem: ConeProblem, limits: Limits, newton: Newton, coulomb: bool):
         self.problem, self.limits, self.newton, self.coulomb = problem, limits, newton, coulomb
         self.all: list[Result] = []
+        self.usual = problem.norm(problem.r) / problem.mean_diagonal  # the size of impulses that the data suggest
         self.most = min(60, limits.max_it)  # iterations of the conic method
 
     def keep(self, result: Result, solver: str) -> Result:
+        """Note a result. Impulses of self-stress may grow in Coulomb's law until their rounding throws bodies away, and
+        the natural residual, which is relative to them, falls: such impulses are none."""
         result.solver, result.newton_its = solver, result.iterations if solver == "conic" else 0
+        if self.coulomb and self.problem.norm(result.impulse) > GROWN * self.usual:
+            if why := why_unbounded(self.problem, result.impulse):
+                result.status, result.reason = Status.UNBOUNDED, why
+            else:
+                result.status, result.residual = Status.STALLED, np.inf
+                result.impulse = np.zeros_like(result.impulse)
         self.all.append(result)
         return result
 
-    def apgd(self, guess: Array, most: int, options: apgd.APGD = apgd.APGD(), spare: int = 0) -> Result:
+    def apgd(self, guess: Array, most: int, options: apgd.APGD = USUAL, spare: int = 0) -> Result:
         limits = replace(self.limits, max_it=min(most, self.limits.max_it), spare=spare)
         return self.keep(apgd.solve(self.problem, guess, limits, options, coulomb=self.coulomb), "apgd")
 
@@ -119,10 +131,15 @@ class Attempts:
     def best(self) -> Result:
         return min(self.all, key=lambda result: result.residual)
 
-    def in_turns(self, options: Auto) -> None:
-        """Plain steps and shorter ones of the conic method; then the relaxation, and cone problems that begin there."""
-        for _ in range(options.turns):
-            if self.apgd(self.best.impulse, options.plain, PLAIN).final or self.conic(self.best.impulse, SHORT).final:
+    def in_turns(self, options: Auto, basin: float) -> None:
+        """Plain steps and shorter ones of the conic method, until APGD can go on; where they do not come so far the
+        relaxation, and cone problems that begin there."""
+        for turn in range(options.turns):
+            most = options.plain * 2**turn
+            if self.apgd(self.best.impulse, most, PLAIN).final or self.conic(self.best.impulse, SHORT).final:
+                return
+            if self.best.residual <= basin:
+                self.apgd(self.best.impulse, self.limits.max_it)
                 return
         problem = self.problem
         by_conic = partial(conic.solve, problem, options=conic.Conic(), newton=self.newton)
@@ -131,8 +148,11 @@ class Attempts:
         if why := why_unbounded(problem, relaxed.impulse):
             self.keep(replace(relaxed, status=Status.UNBOUNDED, reason=f"of the relaxation, {why}"), "conic")
             return
-        terms = fixed_point(lambda g, limits: by_conic(guess=g, limits=limits), problem, relaxed.impulse, limits, TERMS)
-        self.keep(terms.after(relaxed), "conic").exhausted = True
+        last = relaxed = replace(relaxed, status=Status.STALLED, residual=np.inf, reason="relaxation")
+        if len(problem.r) == problem.cones.count:  # without moments, whose terms it does not have
+            last = fixed_point(lambda g, to: by_conic(guess=g, limits=to), problem, relaxed.impulse, limits, TERMS)
+            last.after(relaxed)
+        self.keep(last, "conic").exhausted = True
 
     def result(self) -> Result:
         """The last one, or the best where the first met the limits, or nothing is left to try; with what all have

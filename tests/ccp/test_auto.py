@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mpi4py import MPI
-from problems import SELF, from_graph, heap
+from problems import SELF, from_graph, heap, part
 from test_unbounded import squeezed
 
 from pctt import ccp
@@ -46,6 +46,23 @@ def test_auto_goes_over_to_conic_where_apgd_takes_long(law, contacts, tol, monke
     assert 0 < result.newton_its <= 60
     assert result.iterations >= begun + result.newton_its
     assert result.ksp_its > 0
+
+
+@pytest.mark.parallel(1, 2)
+def test_much_friction_is_solved_in_turns():
+    """Of 6 random problems of friction 3, of which the conic method alone leaves some unsolved."""
+    limits, comm, alone, unsolved = Limits(5e-4, closing_work=0.5, fallback=False), MPI.COMM_WORLD, 0, 0
+    for seed in (11, 12, 13, 15, 24, 30):
+        known, graph = heap(seed, contacts=30, bodies=9, mu=np.full(30, 3.0))
+        G = graph.part(comm)
+        mine = part(comm, 30)
+        problem = ccp.ConeProblem(comm, known.r.reshape(-1, 3)[mine], np.full(G.rows, 3.0), G=G, compliance=0.003)
+        alone += not ccp.solve(problem, type="conic", limits=limits, law=ccp.COULOMB).converged
+        result = ccp.solve(problem, type="auto", limits=limits, law=ccp.COULOMB)
+        unsolved += not result.converged
+        assert result.iterations < 6000
+    assert alone >= 1
+    assert unsolved <= alone // 2
 
 
 def test_the_iterations_of_apgd_grow_with_size_and_accuracy():
