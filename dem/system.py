@@ -151,6 +151,9 @@ class ContactSystem:
                 self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
         if world.pairs.restitution.any():
             self._bounce(world, contacts, freely[:, 0])
+        if contacts.parting is not None:
+            strikes = np.isfinite(contacts.parting)
+            self.b[strikes, 0], self.compliance[strikes] = -contacts.parting[strikes], 0.0
         self.r = _beyond(self.b, freely, rounding)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
@@ -167,6 +170,8 @@ class ContactSystem:
             came = came + self.drift[:, 0]
         closes = contacts.linear_gap + self.dt * freely < 0.0
         begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & closes
+        if contacts.parting is not None:
+            begin &= np.isnan(contacts.parting)
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 

@@ -13,6 +13,7 @@ from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
 from dem.exchange import reduced
 from dem.fast import refuse_passages
+from dem.impacts import in_order
 from dem.impulses import ImpulseMemory
 from dem.joints import Coupling
 from dem.partition import rebalance
@@ -103,6 +104,7 @@ class Stepper:
             put_back(self.world)
             rebalance(self.world)
             contacts = find_contacts(self.world, self.settings.delta, self.settings.dt)
+            contacts = in_order(self.world, contacts, self.settings.dt)
         problem, guess, result = self._solved(contacts)
         with log.phase("output"):
             files = self.dump.step(self.system, problem, guess, result, result.asked or result) if self.dump else {}
@@ -116,7 +118,8 @@ class Stepper:
             self.impulse, self.history = self.system.net(forces), result.history
             self.moment = None if self.system.resistance is None else moments
             self.system.take_flow(self.world, self.contacts)
-            advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt)
+            velocity = self.system.velocity_with(result.momentum)
+            advance(self.world, velocity, self.settings.dt, self.contacts.lag)
             kept = self.system.held_after(result.impulse)  # with which springs begin the next step
             self.memory.remember(self.system.key, kept, self.system.frame)
             self._slabs = self.world.slabs
@@ -190,6 +193,7 @@ class Stepper:
             deep = max(0.01 * delta, left if left < np.inf else 0.0)
             wider = find_overrun(world, contacts, velocity, delta, dt, deep, recovery)
             if wider is not None:
+                wider = in_order(world, wider, dt)
                 return carried(world, contacts, wider) if self._corrections else wider
             if self._corrections < 3 and not world.only_spheres:
                 turned = find_turned(world, contacts, velocity, dt, 0.1 * delta, recovery)
