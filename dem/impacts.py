@@ -48,8 +48,9 @@ def in_order(world: World, contacts: Contacts, dt: float) -> Contacts:
     """The contacts of a step of dt [s] with what impacts that are followed change of them; collective.
 
     Followed are impacts of two spheres, and of spheres that bounce from bodies that forces do not move, if they come
-    faster than a fall of one step. Two spheres that pass each other have no contact that closes. In cells that deform,
-    and where bodies attract each other, nothing is followed."""
+    faster than a fall of one step; without restitution those of two that are near no other. Two spheres that pass each
+    other have no contact that closes. In cells that deform, and where bodies attract each other, nothing is
+    followed."""
     if world.shear is not None or world.servo is not None or world.pairs.cohesion.any():
         return contacts
     near, table, pairs = contacts.near, contacts.near.bodies, world.pairs
@@ -90,6 +91,8 @@ def in_order(world: World, contacts: Contacts, dt: float) -> Contacts:
     names, pair = np.unique(index.astype(np.int64), return_inverse=True)
     pair, state = pair.reshape(-1, 2), np.empty((len(names), body.shape[1]))
     state[pair[:, 0]], state[pair[:, 1]] = one, two
+    more = np.bincount(pair.ravel())[pair].max(axis=1) > 1  # on all ranks together
+    contact[more & (contact[:, 10] == 0.0), 12] = OTHER
     *found, lag = followed(pair, np.ascontiguousarray(contact), state, dt, slow)
     here = slice(first, first + len(mine))
     late, row = lag[pair[here, 1]] - lag[pair[here, 0]], names - world.slabs[world.comm.rank]
@@ -153,6 +156,10 @@ def struck(
     count = len(one)
     kind, bounce, offset = np.full(count, OTHER), np.empty(count), np.zeros((count, 3))
     meets, passes, marked = np.zeros(count, np.bool_), np.zeros(count, np.bool_), np.zeros(len(place), np.bool_)
+    many = np.zeros(len(place), np.int64)
+    for c in range(count):
+        many[one[c]] += 1
+        many[two[c]] += 1
     touches, presses, push = marked.copy(), marked.copy(), np.zeros((len(place), 3))
     for c in range(count):
         a, b, n = one[c], two[c], (normal[c, 0], normal[c, 1], normal[c, 2])
@@ -161,7 +168,7 @@ def struck(
         closed, closes, bounce[c] = gap[c] <= 0.0, linear[c] + dt * dot(v, n) < 0.0, e
         if ball[a] and b >= grains and e > 0.0 and np.isinf(mass[b]):
             kind[c], meets[c] = WALL, closes and dot(v, n) < -slow
-        elif ball[a] and ball[b] and (e > 0.0 or k * dt * dt * (1.0 / mass[a] + 1.0 / mass[b]) > SHORT):
+        elif ball[a] and ball[b] and (e > 0.0 or (many[a] == many[b] == 1 and _is_short(k, mass, a, b, dt))):
             for i in range(3):
                 if np.isfinite(period[i]):
                     offset[c, i] = -period[i] * np.rint((place[b, i] - place[a, i]) / period[i])
@@ -250,6 +257,12 @@ def followed(
             if contact[c, 12] == PAIR:
                 gap[c] = np.sqrt(dot(far, far)) - state[pair[c, 0], 12] - state[pair[c, 1], 12]
     return times > 0, after, gap, normal, now[:, :3] - state[:, :3]
+
+
+@inlined
+def _is_short(stiffness, mass, a, b, dt):
+    """Whether an impact without restitution of two bodies is over in much less than a step."""
+    return stiffness * dt * dt * (1.0 / mass[a] + 1.0 / mass[b]) > SHORT
 
 
 @inlined
