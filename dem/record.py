@@ -315,20 +315,23 @@ def contact_statistics(step: Step) -> dict[str, float]:
 
     A contact is active if its normal impulse exceeds 1 % of the mean, as solvers leave small impulses at others. It
     slides if its tangential impulse is 99 % of what friction can bear, or more. The coordination number is the mean
-    number of active contacts per grain.
+    number of active contacts per grain. Impacts at once are contacts that bounce and are not among those whose order
+    `dem.impacts` follows: where several of them act on a body in a step, energy may be lost.
     """
     comm, contacts, impulse = step.world.comm, step.contacts, step.in_cone
     (count, weight), _ = reduced(comm, (len(contacts), impulse[:, 0].sum()), ())
     grain = contacts.near.bodies.shape != COMPOUND
     least = 0.01 * weight / max(count, 1.0)
     *sums, worst = counted(impulse, contacts.friction, contacts.gap, contacts.a, contacts.b, grain, least)
-    sums, (worst,) = reduced(comm, sums, (max(worst, contacts.held_overlap),))
+    sums, (worst,) = reduced(comm, [*sums, step.system.at_once], (max(worst, contacts.held_overlap),))
+    bounces = {"impacts_at_once": sums[3]} if step.world.pairs.restitution.any() else {}
     return {
         "contacts": count,
         "active_contacts": sums[0],
         "coordination_number": sums[2] / max(step.world.slabs[-1], 1),
         "sliding_fraction": sums[1] / max(sums[0], 1),
         "worst_overlap [m]": worst,
+        **bounces,
     }
 
 

@@ -104,6 +104,17 @@ def test_balls_in_a_row_of_one_step_lose_what_restitution_takes():
     np.testing.assert_allclose(cradle(1e-4, e, False, count=3), v, atol=1e-3)
 
 
+def test_impacts_that_are_not_followed_are_counted():
+    """A box that bounces, and a sphere."""
+    for add, counted in (("add_boxes", True), ("add_spheres", False)):
+        scene = Scene(friction=0.3, gravity=(0, 0, 0), restitution=0.5)
+        scene.add_body("floor", [Plane((0, 0, 1))])
+        size = (R, R, R) if counted else R
+        getattr(scene, add)([[0, 0, 1.5 * R]], size, DENSITY, velocity=(0, 0, -1.0))
+        with pctt.Simulation(scene, dt=0.01 * 0.9, **EXACT) as sim:
+            assert (sim.step()["impacts_at_once"] > 0) == counted
+
+
 def test_a_ball_keeps_its_height_where_nothing_is_lost():
     """e = 1 under gravity: heights of bounces by places of touch, in steps of a third of a radius at most."""
     scene = Scene(friction=0.3, restitution=1.0)
