@@ -324,7 +324,9 @@ def contact_statistics(step: Step) -> dict[str, float]:
     A contact is active if its normal impulse exceeds 1 % of the mean, as solvers leave small impulses at others. It
     slides if its tangential impulse is 99 % of what friction can bear, or more. The coordination number is the mean
     number of active contacts per grain. The unbalanced force is the mean resultant of the forces on a grain over the
-    mean force of an active contact, as of Yade and PFC; 0 without contacts.
+    mean force of an active contact, as of Yade and PFC; 0 without contacts. Impacts at once are contacts that bounce
+    and are not among those whose order `dem.impacts` follows: where several of them act on a body in a step, energy may
+    be lost.
     """
     comm, contacts, impulse = step.world.comm, step.contacts, step.in_cone
     grains, before = step.world.grains, contacts.near.bodies.velocity
@@ -333,7 +335,8 @@ def contact_statistics(step: Step) -> dict[str, float]:
     grain = contacts.near.bodies.shape != COMPOUND
     least = 0.01 * weight / max(count, 1.0)
     *sums, worst = counted(impulse, contacts.friction, contacts.gap, contacts.a, contacts.b, grain, least)
-    sums, (worst,) = reduced(comm, sums, (max(worst, contacts.held_overlap),))
+    sums, (worst,) = reduced(comm, [*sums, step.system.at_once], (max(worst, contacts.held_overlap),))
+    bounces = {"impacts_at_once": sums[3]} if step.world.pairs.restitution.any() else {}
     return {
         "contacts": count,
         "active_contacts": sums[0],
@@ -341,6 +344,7 @@ def contact_statistics(step: Step) -> dict[str, float]:
         "sliding_fraction": sums[1] / max(sums[0], 1),
         "unbalanced_force": push / max(step.world.slabs[-1], 1) * sums[0] / size if size > 0.0 else 0.0,
         "worst_overlap [m]": worst,
+        **bounces,
     }
 
 

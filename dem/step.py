@@ -132,11 +132,14 @@ class Step:
         return self.system.impulse_on_large(self.impulse, self.moment)
 
 
-def advance(world: World, velocity: Floats, dt: float, kept: Floats | None = None) -> None:
+def advance(
+    world: World, velocity: Floats, dt: float, lag: Floats | None = None, kept: Floats | None = None
+) -> None:
     """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; `kept` (owned, 6) are those with
     which they go into the next step, if they are others. Collective.
 
-    x <- x + dt (v + E x), q <- exp(dt w) q, with the rate E of a cell that changes its size.
+    x <- x + dt (v + E x) + lag, q <- exp(dt w) q, with the rate E of a cell that changes its size, and the lag
+    (grains, 3) of `Contacts` [m].
     Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
     large_velocity, start = world.large_velocity(velocity, dt), world.grains.position
@@ -145,6 +148,8 @@ def advance(world: World, velocity: Floats, dt: float, kept: Floats | None = Non
     _move(world.large, large_velocity, dt)
     if kept is not None and large_kept is not None:
         world.grains.velocity, world.large.velocity = kept[: len(world.grains)].copy(), large_kept
+    if lag is not None:
+        world.grains.position = world.grains.position + lag
     if world.servo is not None:
         world.grains.position = world.grains.position + dt * world.servo.rate * start
     if world.springs:
@@ -157,11 +162,11 @@ def advance(world: World, velocity: Floats, dt: float, kept: Floats | None = Non
     follow_motions(world)
 
 
-def advanced(world: World, velocity: Floats, dt: float) -> World:
+def advanced(world: World, velocity: Floats, dt: float, lag: Floats | None = None) -> World:
     """The world that `advance` leads to; this one stays as it is. Collective."""
     after = copy(world)
     after.grains, after.large = replace(world.grains), replace(world.large)
-    advance(after, velocity, dt)
+    advance(after, velocity, dt, lag)
     return after
 
 
@@ -229,7 +234,7 @@ def find_turned(
     """
     if not _turn(world, velocity[: len(world.grains)], dt, depth):
         return None
-    end = find_contacts(advanced(world, velocity, dt), 0.0)
+    end = find_contacts(advanced(world, velocity, dt, contacts.lag), 0.0)
     end = end.take(end.gap < -depth)
     start, approach = _at_start(world, end, dt)
     overlap = -(dt * gap_velocities(world, start, dt, recovery_speed)[2] + approach)
@@ -290,6 +295,8 @@ def carried(world: World, contacts: Contacts, wider: Contacts) -> Contacts:
 
 def _joined(world: World, one: Contacts, other: Contacts) -> Contacts:
     """Both, in the order of contacts."""
+    if (one.parting is None) != (other.parting is None):
+        one, other = (x if x.parting is not None else replace(x, parting=np.full(len(x), np.nan)) for x in (one, other))
     more = other.columns()
     both = {name: np.concatenate([column, more[name]]) for name, column in one.columns().items()}
     order = contact_order(world, one.near, both["a"], both["b"], both["key"])

@@ -80,6 +80,7 @@ class ContactSystem:
         resistance: the rows of `dem.rolling`, or None
         attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.cohesion`
         drives: of the large bodies, the same on all ranks
+        at_once: how many contacts of this rank bounce with all others of the step, and not in their order
         joints: the rows of joints, a `dem.joints.Coupling`; None if there are none
         applied: what loads and springs give, a `dem.applied.Applied`; None if there are none
     """
@@ -169,8 +170,12 @@ class ContactSystem:
                 self.problem_map = CellMap(self.resistance.map, self.cell)
             if self.attraction is not None:
                 self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
+        self.at_once = 0
         if world.pairs.restitution.any():
             self._bounce(world, contacts, freely[:, 0])
+        if contacts.parting is not None:
+            strikes = np.isfinite(contacts.parting)
+            self.b[strikes, 0], self.compliance[strikes] = -contacts.parting[strikes], 0.0
         self.r = _beyond(self.b, freely, rounding)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
@@ -187,6 +192,9 @@ class ContactSystem:
             came = came + self.drift[:, 0]
         closes = contacts.linear_gap + self.dt * freely < 0.0
         begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & closes
+        if contacts.parting is not None:
+            begin &= np.isnan(contacts.parting)
+        self.at_once = int(begin.sum())
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 

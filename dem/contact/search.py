@@ -48,6 +48,12 @@ class Contacts:
     moved: Floats | None = None
     linear: Floats | None = None  #: (nc,) the gaps from which gaps linear in the velocities start; None: `gap` [m]
     drift: Floats | None = None  #: (nc, 3) what the shear adds to the velocity of b relative to a; None: nothing [m/s]
+    #: (nc,) the normal velocities after impacts that `dem.impacts` follows; -inf where two do not meet, NaN where
+    #: nothing is followed; None: nowhere [m/s]
+    parting: Floats | None = None
+    #: (grains, 3) by how much grains end beside the place to which their velocities after the step would bring them, as
+    #: impacts begin at their times of touch; None: nowhere [m]
+    lag: Floats | None = None
     held_overlap: float = 0.0  #: the deepest overlap of bodies that no force can part, left out of the contacts [m]
 
     def __len__(self) -> int:
@@ -55,8 +61,8 @@ class Contacts:
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row per contact by name, without copies."""
-        left = {"near", "shifts", "held_overlap"}
-        left |= {name for name in ("moved", "linear", "drift") if getattr(self, name) is None}
+        left = {"near", "shifts", "lag", "held_overlap"}
+        left |= {name for name in ("moved", "linear", "drift", "parting") if getattr(self, name) is None}
         return {name: value for name, value in vars(self).items() if name not in left}
 
     @property

@@ -13,6 +13,7 @@ from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
 from dem.exchange import reduced
 from dem.fast import refuse_passages
+from dem.impacts import in_order
 from dem.impulses import ImpulseMemory
 from dem.joints import Coupling
 from dem.partition import rebalance
@@ -105,6 +106,7 @@ class Stepper:
             put_back(self.world)
             rebalance(self.world)
             contacts = find_contacts(self.world, self.settings.delta, self.settings.dt)
+            contacts = in_order(self.world, contacts, self.settings.dt)
         problem, guess, result = self._solved(contacts)
         with log.phase("output"):
             files = self.dump.step(self.system, problem, guess, result, result.asked or result) if self.dump else {}
@@ -120,7 +122,7 @@ class Stepper:
             self.system.take_flow(self.world, self.contacts)
             velocity = self.system.velocity_with(result.momentum)
             kept = self.system.kept(self.world, velocity) if self.system.middle is not None else None
-            advance(self.world, velocity, self.settings.dt, kept)
+            advance(self.world, velocity, self.settings.dt, self.contacts.lag, kept)
             kept = self.system.held_after(result.impulse)  # with which springs begin the next step
             self.memory.remember(self.system.key, kept, self.system.frame)
             self._slabs = self.world.slabs
@@ -195,6 +197,7 @@ class Stepper:
             deep = max(0.01 * delta, left if left < np.inf else 0.0)
             wider = find_overrun(world, contacts, velocity, delta, dt, deep, recovery)
             if wider is not None:
+                wider = in_order(world, wider, dt)
                 return carried(world, contacts, wider) if self._corrections else wider
             if self._corrections < 3 and not world.only_spheres:
                 turned = find_turned(world, contacts, velocity, dt, 0.1 * delta, recovery)

@@ -68,10 +68,11 @@ def test_an_impact_takes_nearly_all_speed_whatever_the_step(dt):
 
 
 def test_the_limit_of_great_stiffness_is_the_rigid_contact():
-    velocities = [heads_on(k, 0.01, 3)[0] for k in (1e7, 1e9, 1e11, np.inf)]
+    """From steps on that are longer than impacts of free spheres, these are rigid."""
+    velocities = [heads_on(k, 1e-3, 20)[0] for k in (1e6, 1e7, 1e9, np.inf)]
     off = [np.abs(velocity - velocities[-1]).max() for velocity in velocities[:-1]]
-    assert off[0] > off[1] > off[2]
-    assert off[2] < 1e-4
+    assert off[0] > off[1] > 1e-3
+    assert off[2] < 1e-8
 
 
 @pytest.mark.parametrize("dt", [1e-3, 1e-2])
