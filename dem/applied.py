@@ -12,7 +12,7 @@ from mpi4py import MPI
 from dem import bodies, joints, springs
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import Bodies
-from dem.free_motion import free_velocity
+from dem.free_motion import fallen, free_spin, free_velocity, gyroscopic
 from dem.loads import Load
 from dem.motion import DROOP, Driven, Dynamic, Guided
 from dem.neighbourhood import Neighbourhood
@@ -92,26 +92,31 @@ def _ends(world: World, ids: Ints, grains: Floats, large: Floats, dt: float) -> 
     """The grains of these ids, the large bodies and the world, with the impulses of loads; collective."""
     here = np.flatnonzero(np.isin(world.grains.id, ids))
     own = world.grains.take(here)
-    given = free_velocity(own, world.gravity, dt) + velocity_changes(own, grains[here])
+    change = velocity_changes(own, grains[here])
+    free = free_velocity(own, world.gravity, dt) + change
     root = bodies.inverse_root_inertia(own)
-    columns = own.position, own.quaternion, own.velocity, given, 1.0 / own.mass[:, None], (root @ root).reshape(-1, 9)
-    gathered = np.zeros((len(ids), 29))
-    gathered[np.searchsorted(ids, own.id)] = np.concatenate(columns, axis=1)
+    columns = own.position, own.quaternion, own.velocity, free, 1.0 / own.mass[:, None], (root @ root).reshape(-1, 9)
+    gathered = np.zeros((len(ids), 35))
+    gathered[np.searchsorted(ids, own.id)] = np.concatenate([*columns, own.inertia, change[:, 3:]], axis=1)
     world.comm.Allreduce(MPI.IN_PLACE, gathered)  # each row is that of one rank
-    position, turn, velocity, free, light, moments = np.split(gathered, np.cumsum([3, 4, 6, 6, 1]), axis=1)
+    parts = np.split(gathered, np.cumsum([3, 4, 6, 6, 1, 9, 3]), axis=1)
+    position, turn, velocity, free, light, inverse_inertia, moments, given = parts
     tools = world.large
-    pushed = free_velocity(tools, world.gravity, dt) + velocity_changes(tools, large)
+    change = velocity_changes(tools, large)
+    pushed = free_velocity(tools, world.gravity, dt) + change
     root = bodies.inverse_root_inertia(tools)
     translation = free_directions(world.large_bodies) / tools.mass[:, None, None]
     inverse = np.zeros((len(ids) + len(tools) + 1, 6, 6))
     inverse[:, :3, :3] = np.concatenate([light[:, :, None] * np.eye(3), translation, np.zeros((1, 3, 3))])
-    inverse[:, 3:, 3:] = np.concatenate([moments.reshape(-1, 3, 3), root @ root, np.zeros((1, 3, 3))])
+    inverse[:, 3:, 3:] = np.concatenate([inverse_inertia.reshape(-1, 3, 3), root @ root, np.zeros((1, 3, 3))])
     return Ends(
         np.concatenate([position, tools.position, np.zeros((1, 3))]),
         np.concatenate([turn, tools.quaternion, [[1.0, 0.0, 0.0, 0.0]]]),
         np.concatenate([velocity, tools.velocity, np.zeros((1, 6))]),
         np.concatenate([free, _as_motions_allow(world, pushed, dt), np.zeros((1, 6))]),
         inverse,
+        np.concatenate([moments, tools.inertia, np.full((1, 3), np.inf)]),
+        np.concatenate([given, change[:, 3:], np.zeros((1, 3))]),
     )
 
 
@@ -133,12 +138,19 @@ def joint_ends(world: World, dt: float) -> tuple[Ints, Ints, Ends]:
     return ids, row, _ends(world, ids, grains, large, dt)
 
 
-def joint_coupling(world: World, dt: float) -> joints.Coupling | None:
-    """The joints in the next step of dt [s]; None without any; collective."""
+def joint_coupling(world: World, dt: float, push: Floats | None = None) -> joints.Coupling | None:
+    """The joints in the next step of dt [s]; None without any. `push` (owned, 6): the mass-scaled momenta that contacts
+    are expected to give the bodies whose rows this rank owns. Collective."""
     if not world.joints:
         return None
-    _, row, table = joint_ends(world, dt)
-    given = list(world.joints.values()), row, table, dt, world.period
+    ids, row, table = joint_ends(world, dt)
+    gathered = np.zeros_like(table.free)
+    if push is not None:
+        id = np.concatenate([world.grains.id, world.large.id])[: len(push)]
+        here, slot = slots(world, id)
+        gathered[slot] = push[here]
+        world.comm.Allreduce(MPI.IN_PLACE, gathered)
+    given = list(world.joints.values()), row, table, dt, world.period, gathered
     found = joints.coupling(*given) if world.comm.rank == 0 else None
     return world.comm.bcast(found)  # processors may round in other ways
 
@@ -168,14 +180,34 @@ def velocity_changes(table: Bodies, impulse: Floats) -> Floats:
     return change
 
 
-def free_velocities(world: World, near: Neighbourhood, dt: float, drives: Drives) -> Floats:
-    """Velocities (rows, 6) of all bodies of `near` over a step of dt [s] without contacts; those of ghosts lack what
-    loads give. Collective."""
-    free = free_velocity(near.bodies, world.gravity, dt)
+def free_velocities(
+    world: World, near: Neighbourhood, dt: float, drives: Drives, change: Floats | None
+) -> tuple[Floats, Floats | None]:
+    """Velocities (rows, 6) of all bodies of `near` over a step of dt [s] without contacts, of which those of ghosts are
+    not yet right; and the angular ones (owned, 3) about which they are linear in the impulses, see
+    `dem.free_motion.free_spin`, NaN where they are so anywhere. None without a `change` (owned, 6), what contacts are
+    expected to change. Collective."""
+    free, _ = fallen(near.bodies, world.gravity, dt)
+    first = near.grains + near.ghosts
+    pushed = None
     if world.loaded:
-        free[: near.grains] += velocity_changes(world.grains, applied_impulses(world, dt).grains)
-    free[near.grains + near.ghosts :] = drives.free
-    return free
+        pushed = velocity_changes(world.grains, applied_impulses(world, dt).grains)
+        free[: near.grains] += pushed
+    free[first:] = drives.free
+    if change is None:
+        return free, None
+    owned = len(change)
+    given, middle = np.zeros((owned, 3)), np.full((owned, 3), np.nan)
+    if pushed is not None:
+        given[: near.grains] = pushed[:, 3:]
+    if owned > near.grains:  # of the last rank, which has no ghosts
+        given[near.grains :] = velocity_changes(world.large, drives.impulse)[:, 3:]
+    own = near.bodies.take(slice(owned))
+    rows = gyroscopic(own)
+    now = own.quaternion[rows], own.velocity[rows, 3:], own.inertia[rows]
+    spin, middle[rows] = free_spin(*now, dt, (given + change[:, 3:])[rows])
+    free[rows, 3:] = spin + given[rows]
+    return free, middle
 
 
 def grains_free_velocity(world: World, dt: float) -> Floats:

@@ -97,6 +97,13 @@ def least_half_thickness(bodies: Bodies) -> Floats:
     return np.where(bodies.shape >= CLUMP, bodies.size[:, 2], half)
 
 
+def turning(bodies: Bodies) -> Floats:
+    """Angular speeds (n,) of bodies that are no spheres [rad/s]; zero of spheres, and of what does not turn freely."""
+    x, y, z = bodies.velocity[:, 3:].T
+    speed: Floats = np.hypot(np.hypot(x, y), z)  # squares could overflow
+    return np.where((bodies.shape == SPHERE) | np.isinf(bodies.inertia).any(axis=1), 0.0, speed)
+
+
 def inverse_root_inertia(bodies: Bodies) -> Floats:
     """Symmetric square roots (n, 3, 3) of the inverse inertia tensors in the world frame."""
     turn = quaternion.matrix(bodies.quaternion)

@@ -1,13 +1,21 @@
-"""The motion of the bodies without contact forces, over one step."""
+"""The motion of the bodies without contact forces, over one step, and their angular momentum.
+
+The velocities of a step are those of its middle. Impulses act at its start. A body that is no sphere has then the
+angular momentum L(w) = exp(dt/2 w) I w in the middle of the step, with the inertia I of its start, and impulses J of
+contacts, joints, springs and loads are to give L(w) = L_old + J. The cone problem needs velocities that are linear in
+the impulses: they are so about the spin that the impulses of the last step would lead to (`free_spin`). What they miss
+of the angular momentum is of third order in dt where forces change smoothly, and `kept_spin` gives it back at the end
+of the step: no impulse is lost.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from dem import bodies
-from dem.arrays import Floats, Ints
+from dem.arrays import Bools, Floats, Ints
 from dem.bodies import SPHERE, Bodies
-from dem.compiled import loop
+from dem.compiled import inlined, loop
 from dem.vectors import cross, dot, plus, shares, turned
 
 
@@ -16,16 +24,34 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
 
     Rows of bodies with prescribed motion come back as they are.
     """
-    with np.errstate(over="ignore"):  # `dem.neighbourhood` refuses bodies that are lost
-        change = dt * gravity
-    velocity, others = falling(table.velocity, table.mass, table.shape, change)
+    velocity, others = fallen(table, gravity, dt)
     if not others:  # the torque vanishes where all moments are equal, as for spheres
         return velocity
-    rows = np.flatnonzero(bodies.is_dynamic(table) & (table.shape != SPHERE))
-    a, b, c = table.inertia[rows].T
-    rows = rows[np.isfinite(a + b + c) & ((a != b) | (b != c))]  # guided bodies do not turn
-    velocity[rows, 3:] = free_spin(table.quaternion[rows], velocity[rows, 3:], table.inertia[rows], dt)
+    rows = gyroscopic(table)
+    spin = velocity[rows, 3:]
+    velocity[rows, 3:], _ = free_spin(table.quaternion[rows], spin, table.inertia[rows], dt, np.zeros_like(spin))
     return velocity
+
+
+def fallen(table: Bodies, gravity: Floats, dt: float) -> tuple[Floats, int]:
+    """Velocities (n, 6) after dt [s] under gravity (3,) alone, and how many bodies that forces move are no spheres."""
+    with np.errstate(over="ignore"):  # `dem.neighbourhood` refuses bodies that are lost
+        change = dt * gravity
+    return falling(table.velocity, table.mass, table.shape, change)
+
+
+def gyroscopic(table: Bodies) -> Ints:
+    """The rows of bodies that turn freely and whose three moments are not equal."""
+    rows = np.flatnonzero(bodies.is_dynamic(table) & (table.shape != SPHERE))
+    return rows[unequal(table.inertia[rows])]
+
+
+def unequal(moments: Floats) -> Bools:
+    """Which bodies (n,) of these principal moments (n, 3) turn freely and have not three equal ones: guided and hinged
+    bodies have infinite ones."""
+    a, b, c = moments.T
+    mask: Bools = np.isfinite(a + b + c) & ((a != b) | (b != c))
+    return mask
 
 
 @loop
@@ -42,48 +68,105 @@ def falling(velocity: Floats, mass: Floats, shape: Ints, change: Floats) -> tupl
 
 
 @loop
-def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float) -> Floats:
-    """Angular velocities (n, 3) [rad/s] after dt [s] without torque, from `spin` (n, 3), of bodies with orientations
-    `turn` (n, 4) at the start of the step and principal moments (n, 3). All vectors are in the world frame.
+def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float, change: Floats) -> tuple[Floats, Floats]:
+    """Angular velocities (n, 3) [rad/s] in a step of dt [s] without impulses, from `spin` (n, 3) in the last one, of
+    bodies with orientations `turn` (n, 4) at the start of the step and principal moments (n, 3); and those (n, 3) with
+    impulses that are expected to change them by `change` (n, 3), which the first ones and I^-1 J add up to. All vectors
+    are in the world frame.
 
     A step turns a body by exp(dt w). In the middle of it the body has the angular momentum exp(dt/2 w) I w in the frame
     of its start, and in the middle of the last step it had exp(-dt/2 w_old) I w_old. Newton's method makes the two
-    equal: the angular momentum is kept, and the energy to O(dt^2) (compare Simo and Wong, International Journal for
-    Numerical Methods in Engineering 31, 1991). A body that turns by much more than a radian, for which it does not
-    converge, keeps its spin.
+    equal, less the expected impulses: the angular momentum is kept, and the energy to O(dt^2) (compare Simo and Wong,
+    International Journal for Numerical Methods in Engineering 31, 1991). Where it does not converge with the expected
+    impulses, they are left out. A body that turns by much more than a radian, for which it does not converge at all,
+    keeps its spin, and the second one is NaN.
     """
-    out = spin.copy()
+    out, middle = spin.copy(), np.full_like(spin, np.nan)
     half = 0.5 * dt
     for n in range(len(spin)):
         frame, twice = (turn[n, 1], turn[n, 2], turn[n, 3]), 2.0 * turn[n, 0]
         w = turned((spin[n, 0], spin[n, 1], spin[n, 2]), frame, -twice, 2.0)
-        largest = max(moments[n, 0], moments[n, 1], moments[n, 2])
-        inertia = (moments[n, 0] / largest, moments[n, 1] / largest, moments[n, 2] / largest)
+        c = turned((change[n, 0], change[n, 1], change[n, 2]), frame, -twice, 2.0)
+        inertia = _shape_of(moments[n])
         rotation = plus(_ZERO, half, w)
         sine, versed = shares(rotation)
-        momentum, new = turned(_each(inertia, w), rotation, -sine, versed), w
-        for _ in range(4):  # enough below half a radian a step
-            middle = turned(_each(inertia, new), rotation, sine, versed)
-            change = _solve(
-                _slope((inertia[0], 0.0, 0.0), (1.0, 0.0, 0.0), rotation, sine, versed, middle, half),
-                _slope((0.0, inertia[1], 0.0), (0.0, 1.0, 0.0), rotation, sine, versed, middle, half),
-                _slope((0.0, 0.0, inertia[2]), (0.0, 0.0, 1.0), rotation, sine, versed, middle, half),
-                plus(momentum, -1.0, middle),
-            )
-            new = plus(new, 1.0, change)
-            rotation = plus(_ZERO, half, new)
-            sine, versed = shares(rotation)
-            if dot(change, change) <= 1e-16 * dot(w, w):
-                break  # the next change would be its square
-        back = turned(momentum, rotation, -sine, versed)
-        error = plus(back, -1.0, _each(inertia, new))
-        if dot(error, error) <= 1e-12 * dot(momentum, momentum):  # else a step does not resolve the motion
-            solved = back[0] / inertia[0], back[1] / inertia[1], back[2] / inertia[2]
-            out[n, 0], out[n, 1], out[n, 2] = turned(solved, frame, twice, 2.0)
+        momentum = turned(_each(inertia, w), rotation, -sine, versed)
+        for share in (1.0, 0.0):
+            new, found = _spin_of(inertia, plus(momentum, share, _each(inertia, c)), plus(w, share, c), half)
+            if found:
+                without = turned(plus(new, -share, c), frame, twice, 2.0)
+                new = turned(new, frame, twice, 2.0)
+                for k in range(3):
+                    out[n, k], middle[n, k] = without[k], new[k]
+                break
+    return out, middle
+
+
+@loop
+def kept_spin(turn: Floats, spin: Floats, middle: Floats, moments: Floats, dt: float) -> Floats:
+    """The angular velocities (n, 3) [rad/s] with which bodies go into the next step, where they have turned with `spin`
+    (n, 3) in one of dt [s] about which their velocities were linear at `middle` (n, 3), see `free_spin`.
+
+    The momentum in the middle of the step is L(middle) + I (spin - middle), and that of the angular velocity w in the
+    orientation of the end is exp(-dt/2 w) I w, the same where spin is middle. Newton's method finds w.
+    """
+    out = spin.copy()
+    half = 0.5 * dt
+    for n in range(len(spin)):
+        if np.isnan(middle[n, 0]):
+            continue
+        frame, twice = (turn[n, 1], turn[n, 2], turn[n, 3]), 2.0 * turn[n, 0]
+        w = turned((spin[n, 0], spin[n, 1], spin[n, 2]), frame, -twice, 2.0)
+        x = turned((middle[n, 0], middle[n, 1], middle[n, 2]), frame, -twice, 2.0)
+        inertia = _shape_of(moments[n])
+        rotation = plus(_ZERO, half, x)
+        sine, versed = shares(rotation)
+        momentum = turned(_each(inertia, x), rotation, sine, versed)
+        momentum = plus(momentum, 1.0, _each(inertia, plus(w, -1.0, x)))
+        rotation = plus(_ZERO, dt, w)
+        sine, versed = shares(rotation)
+        new, found = _spin_of(inertia, turned(momentum, rotation, -sine, versed), w, -half)
+        if found:
+            new = turned(turned(new, rotation, sine, versed), frame, twice, 2.0)
+            for k in range(3):
+                out[n, k] = new[k]
     return out
 
 
 _ZERO = (0.0, 0.0, 0.0)
+
+
+@inlined
+def _shape_of(moments):
+    """The moments over the largest of them."""
+    largest = max(moments[0], moments[1], moments[2])
+    return moments[0] / largest, moments[1] / largest, moments[2] / largest
+
+
+@loop
+def _spin_of(inertia, momentum, start, half):
+    """The spin w with exp(half w) I w = momentum, by Newton's method from `start`, and whether it was found. All are in
+    the frame of the body."""
+    new = start
+    rotation = plus(_ZERO, half, new)
+    sine, versed = shares(rotation)
+    for _ in range(5):  # enough below half a radian a step
+        middle = turned(_each(inertia, new), rotation, sine, versed)
+        change = _solve(
+            _slope((inertia[0], 0.0, 0.0), (1.0, 0.0, 0.0), rotation, sine, versed, middle, half),
+            _slope((0.0, inertia[1], 0.0), (0.0, 1.0, 0.0), rotation, sine, versed, middle, half),
+            _slope((0.0, 0.0, inertia[2]), (0.0, 0.0, 1.0), rotation, sine, versed, middle, half),
+            plus(momentum, -1.0, middle),
+        )
+        new = plus(new, 1.0, change)
+        rotation = plus(_ZERO, half, new)
+        sine, versed = shares(rotation)
+        if dot(change, change) <= 1e-16 * dot(start, start):
+            break  # the next change would be its square
+    back = turned(momentum, rotation, -sine, versed)
+    error = plus(back, -1.0, _each(inertia, new))
+    found = dot(error, error) <= 1e-12 * dot(momentum, momentum)  # else a step does not resolve the motion
+    return (back[0] / inertia[0], back[1] / inertia[1], back[2] / inertia[2]), found
 
 
 @loop

@@ -4,7 +4,7 @@ A joint has rows J of the velocities of its two bodies. In a step with the free 
 
     v = v* + M^-1 J' g,    J v + e (g - f) = t,
 
-with t = -error / dt for what the joint holds, so that its error is gone at the end of the step, to second order in dt.
+with t for what the joint holds such that its error is gone at the end of the step, see `coupling`.
 Motors have t = their speed. Their e is 0 if nothing bounds them. A bounded one gives the impulse f which brings it to
 its speed without contacts, within its strength, and e as `dem.motion.Driven` has its grip. Contacts see the joints in
 their inverse mass (`dem.contact_map.jointed`), so joints and contacts are solved together. Which limits are reached and
@@ -24,6 +24,7 @@ import numpy as np
 
 from dem import checks, quaternion
 from dem.arrays import Bools, Floats, Ints
+from dem.free_motion import free_spin, unequal
 from dem.motion import DROOP
 from dem.springs import End, Ends
 
@@ -35,6 +36,8 @@ HOLDS = {
     "ball": (True, True, True, False, False, False),
     "fixed": (True,) * 6,
 }
+
+ROUNDS = 8  #: of the iteration for what is not linear in the velocities, at most
 
 HELD, MOTOR, LOWER, UPPER = range(4)  #: kinds of rows: what a joint holds, its motor, its limits
 
@@ -160,6 +163,8 @@ class Coupling:
     impulse: Floats  #: (k,) without contacts [N s, N m s]
     change: Floats  #: (n, 6) of velocities, by these impulses
     matrix: Floats  #: (6 n, 6 n) K of `dem.contact_map.jointed`
+    spin: Floats  #: (n, 3) angular velocities without joints and contacts; NaN where all moments are equal, or infinite
+    middle: Floats  #: (n, 3) about which they are linear in the impulses, see `dem.free_motion.free_spin`
 
     def impulses(self, push: Floats) -> Floats:
         """Impulses (k,) of the rows where contacts give the bodies the mass-scaled momenta `push` (n, 6)."""
@@ -171,10 +176,17 @@ class Coupling:
         return bool(((self.kind > MOTOR) | np.isfinite(self.bound)).any())
 
 
-def coupling(joints: Sequence[Joint], row: Ints, ends: Ends, dt: float, period: Floats | None = None) -> Coupling:
-    """Of joints between bodies in the rows `row` (n, 2) in a step of dt [s], with the period of the cell.
+def coupling(
+    joints: Sequence[Joint], row: Ints, ends: Ends, dt: float, period: Floats | None, push: Floats
+) -> Coupling:
+    """Of joints between bodies in the rows `row` (n, 2) in a step of dt [s], with the period of the cell, where
+    contacts are expected to give the bodies the mass-scaled momenta `push` (n, 6).
 
-    Motors that are too weak, and limits that are reached, are found without contacts, by an active set."""
+    Motors that are too weak, and limits that are reached, are found without contacts, by an active set. What is not
+    linear is found by a fixed-point iteration, whose error falls by about the angle of a step each time: the angular
+    momentum of bodies that are no spheres, and the errors of joints at the end of the step. So joints hold there, as
+    in the method SHAKE, with forces of the start of the step, and energy does not drift (Hairer, Lubich, Wanner,
+    "Geometric Numerical Integration", section VII.1.4)."""
     found = geometry(joints, row, ends, period)
     count = len(ends.free)
     chosen: list[tuple[int, int]] = []
@@ -206,20 +218,40 @@ def coupling(joints: Sequence[Joint], row: Ints, ends: Ends, dt: float, period: 
         np.add.at(J, (np.arange(len(t)), row[which, side]), found.rows[which, ways, side])
     root = _roots(ends.inverse_mass)
     B = np.einsum("knx,nxy->kny", J, root).reshape(len(t), -1)
-    now, free = J.reshape(len(t), -1) @ ends.velocity.ravel(), J.reshape(len(t), -1) @ ends.free.ravel()
+    now, velocity = J.reshape(len(t), -1) @ ends.velocity.ravel(), ends.free.copy()
     A = B @ B.T
     slip = np.maximum(DROOP * np.abs(t), np.abs(t - now))
     motors = np.isfinite(bound)
     slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
     on, given = kind <= MOTOR, np.zeros(len(t))
-    for _ in range(2 * len(t) + 1):
-        g = _impulses(A, t, free, on, given)
-        wrong = _wrong(kind, t, bound, on, g, free + A @ g, 0.0)
-        if not wrong.any():
+    rows = np.flatnonzero(unequal(ends.moments))
+    known = ends.quaternion[rows], ends.velocity[rows, 3:], ends.moments[rows]
+    spin, middle = np.full((2, count, 3), np.nan)
+    held, left = kind == HELD, t.copy()
+    expected, pushed = push.ravel(), B @ push.ravel()
+    for _ in range(ROUNDS):
+        change = np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
+        alone, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.given[rows])
+        spin[rows] = velocity[rows, 3:] = alone + ends.given[rows]
+        free = J.reshape(len(t), -1) @ velocity.ravel()
+        for _ in range(2 * len(t) + 1):
+            g = _impulses(A, t, free, on, given)
+            wrong = _wrong(kind, t, bound, on, g, free + A @ g, 0.0)
+            if not wrong.any():
+                break
+            on, given = _turned(kind, bound, on, given, g, wrong)
+        last, expected = expected, B.T @ g
+        if pushed.any():
+            expected = push.ravel() + B.T @ _impulses(A, t, free + pushed, on, given)
+        if np.abs(expected - last).max() <= 1e-7 * np.abs(expected).max():
             break
-        on, given = _turned(kind, bound, on, given, g, wrong)
+        after = velocity + np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
+        place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after[:, 3:], dt)
+        error = geometry(joints, row, dataclasses.replace(ends, position=place, quaternion=turn), period).error
+        bent = (error - found.error)[which, ways] / dt - J.reshape(len(t), -1) @ after.ravel()
+        t = np.where(held, left - bent, left)
     fixed = (J, B, root, which, ways, kind, t, bound, free, slip, found.axes)
-    return Coupling(*fixed, on, given, *_solved(B, root, t, bound, free, slip, on, given))
+    return Coupling(*fixed, on, given, *_solved(B, root, t, bound, free, slip, on, given), spin=spin, middle=middle)
 
 
 def refound(known: Coupling, push: Floats) -> Coupling | None:

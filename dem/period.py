@@ -46,6 +46,18 @@ def crossed(position: Floats, shear: Shear) -> Floats:
     return number + (place - shear.length * number >= shear.length)  # a negative number that rounding makes a period
 
 
+def lattice(period: Floats | None, shear: Shear | None) -> tuple[Floats, Floats]:
+    """The ways (3, 3) to the next images along each axis [m], and their velocities (3, 3) [m/s]; zeros along axes
+    without a period. Sheared images are the nearest along x."""
+    way, drift = np.zeros((3, 3)), np.zeros((3, 3))
+    if period is not None:
+        np.fill_diagonal(way, np.where(np.isfinite(period), period, 0.0))
+        if shear is not None:
+            way[shear.axis, 0] = shear.shift - period[0] * np.round(shear.shift / period[0])
+            drift[shear.axis, 0] = shear.speed
+    return way, drift
+
+
 def resize(world: World, dt: float) -> None:
     """Let the periods grow for dt [s] as the servo of the cell says, and the shift and speed of sheared images with
     them."""
@@ -55,6 +67,18 @@ def resize(world: World, dt: float) -> None:
         if world.shear is not None:
             length = float(world.period[world.shear.axis])
             world.shear = replace(world.shear, shift=world.shear.shift * float(stretch[0]), length=length)
+
+
+def before(world: World, dt: float) -> tuple[Floats | None, Shear | None]:
+    """The periods (3,) and the shear at the start of the step of dt [s] that has led to this world; see `resize`."""
+    if world.period is None:
+        return None, None
+    stretch = np.ones(3) if world.servo is None else 1.0 + dt * world.servo.rate
+    period, shear = world.period / stretch, world.shear
+    if shear is not None:
+        length = float(period[shear.axis])
+        shear = replace(shear, shift=shear.shift / float(stretch[0]) - dt * shear.rate * length, length=length)
+    return period, shear
 
 
 def velocity_in_cell(position: Floats, velocity: Floats, shear: Shear | None) -> Floats:

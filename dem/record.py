@@ -114,6 +114,7 @@ def outside_of(place: Floats, low: Floats, high: Floats) -> int:
 CREATED, SUDDEN = 0.1, 10.0
 SLOW = 0.1  #: a body is at rest below this part of the speed that a step of free fall gives
 CREEP = 1e-6  #: or below this part of its radius in a step
+SUNK = 1e-3  #: a rise of the energy is none if bodies would get it by sinking for this part of their radii
 
 
 def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
@@ -158,12 +159,13 @@ def energy_balance(step: Step) -> dict[str, float]:
     what holds bodies in part, of belts, loads, springs and the shear of a cell. The rest is the error of the semi-
     implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
 
-    Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be. What they
-    lose or gain between two steps by the difference is in no term: the spring energy of a step less that before the
-    next.
+    Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be, but hold
+    no more than impulses have loaded them with (`dem.stiffness.spring_energies`). What they lose or gain between two
+    steps is in no term: the spring energy of a step less that before the next.
 
     The jump is the rise of the kinetic energy in a step in which it rises by more than the work of motions, gravity
     and springs allows, or to more than ten times what there was, although gravity and drives do not give that; else 0.
+    Less than what bodies get by sinking a little (SUNK) is none: structures swing on their springs.
     Springs may give that too where no moving tool of prescribed motion can have loaded them. What there was includes
     what bodies at rest have (SLOW), and what those have that go with the tool they touch.
     """
@@ -183,8 +185,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     mean = 0.5 * (velocity[first:] + world.large.velocity)
     speeds = [table.velocity for table in after]
     normal, tangential, opening = system.works(step.in_cone, velocity, speeds[0], speeds[1], step.moment)
-    gaps = step.contacts.gap, step.contacts.linear_gap + system.dt * opening
-    *springs, strained, strained_at_end = system.spring_energies(*gaps, step.impulse)
+    *springs, strained, strained_at_end = system.spring_energies(step.contacts, velocity, opening, step.in_cone)
     received = np.vdot(step.impulse_on_large[~moves], mean[~moves])
     loads = 0.0
     if system.applied is not None:
@@ -199,12 +200,12 @@ def energy_balance(step: Step) -> dict[str, float]:
     holding += joints
     driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + loads + belts + holding
     work = driving - received
-    still = sums(*(_still(table, world.gravity, system.dt) for table in after))
+    still, least = sums(*(_still(table, world.gravity, system.dt) for table in after))
     cohesion = 0.0
     if system.attraction is not None:
         cohesion = system.works(step.impulse, velocity, *speeds)[0] - normal
-    along = strained, strained_at_end
-    whole = np.array([*was, *now, normal, tangential, *springs, still, _carried(step, ~moves), cohesion, *along])
+    more = cohesion, strained, strained_at_end, least
+    whole = np.array([*was, *now, normal, tangential, *springs, still, _carried(step, ~moves), *more])
     comm.Allreduce(MPI.IN_PLACE, whole)
     change, held, strained = whole[2] + whole[3] - whole[0] - whole[1], whole[7] - whole[6], whole[12] - whole[11]
     rise, fallen, released = whole[2] - whole[0], whole[1] - whole[3], max(-held, 0.0) + max(-strained, 0.0)
@@ -213,7 +214,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     pulled = 2.0 * max(whole[10], 0.0) + max(joints_at_end - joints, 0.0)
     created = rise - fallen - work - released - pulled > CREATED * (there + whole[6] + whole[11] + abs(work))
     driven = max(fallen, 0.0) + max(driving, 0.0) + pulled + released * (whole[9] == 0.0)
-    jumps = rise > 0.0 and (created or whole[2] - driven > SUDDEN * there + CREATED * driven)
+    jumps = rise > whole[13] and (created or whole[2] - driven > SUDDEN * there + CREATED * driven)
     return {
         "kinetic_energy [J]": whole[2],
         "potential_energy [J]": whole[3],
@@ -228,25 +229,32 @@ def energy_balance(step: Step) -> dict[str, float]:
     }
 
 
-def _still(table: Bodies, gravity: Floats, dt: float) -> float:
+def _still(table: Bodies, gravity: Floats, dt: float) -> tuple[float, float]:
     """The kinetic energy [J] that bodies at rest may have by the errors of a solver: a part SLOW of what gravity gives
-    in a step, or a way of CREEP radii, of large bodies those of gyration."""
-    radius, fall = bodies.bounding_radius(table), SLOW * dt * math.hypot(*gravity)
-    return still_energy(table.mass, table.inertia, table.shape, radius, fall, CREEP / dt)
+    in a step, or a way of CREEP radii, of large bodies those of gyration. And the energy of their weights times a part
+    SUNK of these radii [J]."""
+    radius, g = bodies.bounding_radius(table), math.hypot(*gravity)
+    energy, moment = still_energy(table.mass, table.inertia, table.shape, radius, SLOW * dt * g, CREEP / dt)
+    return energy, SUNK * g * moment
 
 
 @loop
-def still_energy(mass: Floats, inertia: Floats, shape: Ints, radius: Floats, fall: float, creep: float) -> float:
-    """The kinetic energy [J] of n bodies with the speed `fall` [m/s], or with `creep` radii [1/s] if that is more."""
-    energy = 0.0
+def still_energy(
+    mass: Floats, inertia: Floats, shape: Ints, radius: Floats, fall: float, creep: float
+) -> tuple[float, float]:
+    """The kinetic energy [J] of n bodies with the speed `fall` [m/s], or with `creep` radii [1/s] if that is more; and
+    the sum of masses times radii [kg m]."""
+    energy, moment = 0.0, 0.0
     for n in range(len(mass)):
         if np.isfinite(mass[n]):
             size = radius[n]
             if shape[n] == COMPOUND:
                 size = np.sqrt(min(inertia[n, 0], inertia[n, 1], inertia[n, 2]) / mass[n])
-            speed = max(fall, creep * size if np.isfinite(size) else 0.0)  # what cannot turn has no radius
+            size = size if np.isfinite(size) else 0.0  # what cannot turn has no radius
+            speed = max(fall, creep * size)
             energy += 0.5 * mass[n] * speed**2
-    return energy
+            moment += mass[n] * size
+    return energy, moment
 
 
 def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
@@ -315,10 +323,13 @@ def contact_statistics(step: Step) -> dict[str, float]:
 
     A contact is active if its normal impulse exceeds 1 % of the mean, as solvers leave small impulses at others. It
     slides if its tangential impulse is 99 % of what friction can bear, or more. The coordination number is the mean
-    number of active contacts per grain.
+    number of active contacts per grain. The unbalanced force is the mean resultant of the forces on a grain over the
+    mean force of an active contact, as of Yade and PFC; 0 without contacts.
     """
     comm, contacts, impulse = step.world.comm, step.contacts, step.in_cone
-    (count, weight), _ = reduced(comm, (len(contacts), impulse[:, 0].sum()), ())
+    grains, before = step.world.grains, contacts.near.bodies.velocity
+    push, size = momentum_change(grains.mass, before, grains.velocity), impulse_sizes(impulse)
+    (count, weight, push, size), _ = reduced(comm, (len(contacts), impulse[:, 0].sum(), push, size), ())
     grain = contacts.near.bodies.shape != COMPOUND
     least = 0.01 * weight / max(count, 1.0)
     *sums, worst = counted(impulse, contacts.friction, contacts.gap, contacts.a, contacts.b, grain, least)
@@ -328,8 +339,29 @@ def contact_statistics(step: Step) -> dict[str, float]:
         "active_contacts": sums[0],
         "coordination_number": sums[2] / max(step.world.slabs[-1], 1),
         "sliding_fraction": sums[1] / max(sums[0], 1),
+        "unbalanced_force": push / max(step.world.slabs[-1], 1) * sums[0] / size if size > 0.0 else 0.0,
         "worst_overlap [m]": worst,
     }
+
+
+@loop
+def momentum_change(mass: Floats, before: Floats, after: Floats) -> float:
+    """The sum of the sizes of the changes of the momenta of n bodies of finite mass, with velocities (n, 6) before and
+    after [N s]; `before` may have more rows."""
+    total = 0.0
+    for n in range(len(mass)):
+        x, y, z = after[n, 0] - before[n, 0], after[n, 1] - before[n, 1], after[n, 2] - before[n, 2]
+        total += mass[n] * np.sqrt(x * x + y * y + z * z)
+    return total
+
+
+@loop
+def impulse_sizes(impulse: Floats) -> float:
+    """The sum of the sizes of impulses (nc, 3)."""
+    total = 0.0
+    for c in range(len(impulse)):
+        total += np.sqrt(impulse[c, 0] ** 2 + impulse[c, 1] ** 2 + impulse[c, 2] ** 2)
+    return total
 
 
 @loop

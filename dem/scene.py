@@ -419,7 +419,7 @@ class Scene:
         if not name or name in self.springs:
             raise ValueError(f"springs need distinct names, got {name!r}")
         spring = Spring((one, other), (anchor, other_anchor), stiffness, damping, 0.0 if length is None else length)
-        poses = [self._pose(f"spring {name!r}", end) for end in spring.ends]
+        poses = [self.pose(f"spring {name!r}", end) for end in spring.ends]
         places = [place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, spring.anchors)]
         rest = float(np.linalg.norm(places[1] - places[0])) if length is None else length
         self.springs[name] = replace(spring, length=rest)
@@ -453,7 +453,7 @@ class Scene:
         x = across(np.array(z)[None])[0]
         upright = quaternion.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
         anchors, frames = [], []
-        for position, turn in (self._pose(f"joint {name!r}", end) for end in (one, other)):
+        for position, turn in (self.pose(f"joint {name!r}", end) for end in (one, other)):
             back, arm = quaternion.conjugate(turn), place - position
             arm = arm - whole_periods(arm, self.period)
             anchors.append(tuple(quaternion.rotate(back, arm).tolist()))
@@ -464,17 +464,21 @@ class Scene:
         low, high = map(float, limits)
         self.joints[name] = Joint(kind, (one, other), anchors, frames, speed, target, float(strength), low, high)
 
-    def _pose(self, what: str, end: End) -> tuple[Floats, Floats]:
+    def pose(self, what: str, end: End) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) of an end of a spring or joint at time 0; ValueError if there is none."""
         if end is None:
             return np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
         if isinstance(end, str):
             table = self.large().take(np.flatnonzero([body.name == end for body in self.large_bodies]))
         else:
-            table = self._rows(end, end + 1) if 0 <= end < self.count else bodies.none()
+            table = self.row(end) if 0 <= end < self.count else bodies.none()
         if not len(table):
             raise ValueError(f"{what}: there is no body or grain {end!r} yet")
         return table.position[0], table.quaternion[0]
+
+    def row(self, id: int) -> Bodies:
+        """The table of one grain at time zero."""
+        return self._rows(id, id + 1)
 
     def add_source(self, name: str, region: Block | Cylinder, *, material: str = "default", **given: Any) -> None:
         """Let grains come in a region of `dem.measures`, where there is room; `given` are the fields of

@@ -63,6 +63,8 @@ class Ends:
     velocity: Floats  #: (n, 6) before the step
     free: Floats  #: (n, 6) after the step, without contacts, springs and drives [m/s, rad/s]
     inverse_mass: Floats  #: (n, 6, 6)
+    moments: Floats  #: (n, 3) principal moments of inertia, inf: it does not turn freely [kg m^2]
+    given: Floats  #: (n, 3) what loads and springs change of the angular velocities in `free` [rad/s]
 
 
 def vectors(springs: list[Spring], row: np.ndarray, ends: Ends) -> tuple[Floats, Floats]:

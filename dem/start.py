@@ -18,7 +18,7 @@ from dem.exchange import exchange, refuse
 from dem.partition import redistribute
 from dem.period import put_back, velocity_in_cell, wrapped
 from dem.polyhedra import Solid
-from dem.scene import Scene
+from dem.scene import Scene, least_half
 from dem.sources import Tally, from_array
 from dem.step import follow_motions
 from dem.world import Servo, Shear, World, refuse_load
@@ -28,7 +28,7 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     """The scene at time zero, distributed; collective.
 
     Bodies of prescribed motion are where their motions put them at time zero. ValueError if nothing moves, or if
-    grains overlap each other or a large body by more than `overlap` radii; SceneError if a motion fails.
+    bodies overlap by more than `overlap` half thicknesses (`_refuse_overlap`); SceneError if a motion fails.
     """
     scene.survey(comm)
     rows = even_slice(scene.count, comm)
@@ -184,18 +184,26 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
 
 
 def _refuse_overlap(world: World, overlap: float) -> None:
-    """ValueError, on all ranks, that names the worst pair if bodies overlap by more than `overlap` radii."""
+    """ValueError, on all ranks, that names the worst pair if bodies overlap by more than `overlap` half thicknesses of
+    the thinner one that forces move.
+
+    Large bodies that a joint joins may share a place, and so may those that no force can part (`held_overlap`)."""
     contacts = find_contacts(world, 0.0)
     world.grains.weight[:] = 0.0
     table = contacts.near.bodies
     worst = (0.0, 0.0, -1, -1)
     if len(contacts):
-        radius = bodies.bounding_radius(table)
-        radius[table.shape == bodies.COMPOUND] = np.inf
-        relative = -contacts.gap / np.minimum(radius[contacts.a], radius[contacts.b])
+        half, large = bodies.least_half_thickness(table), table.shape == bodies.COMPOUND
+        moves = bodies.is_dynamic(world.large)
+        half[large] = np.where(moves, [least_half(body) for body in world.large_bodies], np.inf)
+        relative = -contacts.gap / np.minimum(half[contacts.a], half[contacts.b])
+        pair = np.stack([table.id[contacts.a], table.id[contacts.b]], axis=1)
+        for joint in world.joints.values():
+            if all(isinstance(end, str) for end in joint.ends):
+                ends = sorted(world.large.id[world.large_row(str(end))] for end in joint.ends)
+                relative[(pair == ends).all(axis=1)] = 0.0
         c = int(np.argmax(relative))
-        a, b = int(table.id[contacts.a[c]]), int(table.id[contacts.b[c]])
-        worst = (float(relative[c]), float(-contacts.gap[c]), a, b)
+        worst = (float(relative[c]), float(-contacts.gap[c]), int(pair[c, 0]), int(pair[c, 1]))
     relative_depth, depth, a, b = world.comm.allreduce(worst, MPI.MAX)
     if relative_depth > overlap:
         raise ValueError(f"overlapping start: {world.name_of(a)} and {world.name_of(b)} overlap by {depth:g} m")

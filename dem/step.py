@@ -21,7 +21,7 @@ from dem.contact import Contacts, cell_way, contact_order, find_contacts, goes_b
 from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
 from dem.measures import Sample
-from dem.period import resize, velocity_in_cell, wrapped
+from dem.period import before, lattice, resize, velocity_in_cell, wrapped
 from dem.system import ContactSystem, contact_arms, contact_frames, gap_velocities
 from dem.together import meet
 from dem.world import World
@@ -92,15 +92,20 @@ class Step:
         return np.einsum("ci,cij->cj", size, self.system.frame)
 
     @cached_property
+    def point(self) -> Floats:
+        """The points (nc, 3) of the contacts at the start of the step, in the cell that there was [m]."""
+        return wrapped(self.contacts.point, *before(self.world, self.system.dt))
+
+    @cached_property
     def sample(self) -> Sample:
         """This rank's grains and contacts for the functions of `dem.measures`; not collective."""
         contacts, grains, near = self.contacts, self.world.grains, self.contacts.near.bodies
         pair = np.stack([contacts.a, contacts.b], axis=1)
-        point, center = contacts.point, near.position[pair]
+        center = near.position[pair]
         if contacts.moved is not None:
             center[:, 1] += contacts.moved
-            point = wrapped(point, self.world.period, self.world.shear)
-            center += (point - contacts.point)[:, None]
+            center += (self.point - contacts.point)[:, None]
+        way, drift = lattice(self.world.period, self.world.shear)
         number, first, count = near.id[pair], self.world.first_large, self.world.ids
         names = ("id", "mass", "shape", "size", "material")
         return Sample(
@@ -112,11 +117,13 @@ class Step:
             velocity=velocity_in_cell(grains.position, grains.velocity, self.world.shear),
             position=wrapped(grains.position, self.world.period, self.world.shear),
             center=center,
-            point=point,
+            point=self.point,
             normal=contacts.normal,
             gap=contacts.gap,
             force=self.force,
             moment=self.moments,
+            lattice=way,
+            drift=drift,
         )
 
     @cached_property
@@ -125,15 +132,19 @@ class Step:
         return self.system.impulse_on_large(self.impulse, self.moment)
 
 
-def advance(world: World, velocity: Floats, dt: float) -> None:
-    """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; collective.
+def advance(world: World, velocity: Floats, dt: float, kept: Floats | None = None) -> None:
+    """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; `kept` (owned, 6) are those with
+    which they go into the next step, if they are others. Collective.
 
     x <- x + dt (v + E x), q <- exp(dt w) q, with the rate E of a cell that changes its size.
     Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
     """
     large_velocity, start = world.large_velocity(velocity, dt), world.grains.position
+    large_kept = None if kept is None else world.large_velocity(kept, dt)
     _move(world.grains, velocity[: len(world.grains)], dt)
     _move(world.large, large_velocity, dt)
+    if kept is not None and large_kept is not None:
+        world.grains.velocity, world.large.velocity = kept[: len(world.grains)].copy(), large_kept
     if world.servo is not None:
         world.grains.position = world.grains.position + dt * world.servo.rate * start
     if world.springs:

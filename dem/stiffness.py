@@ -33,18 +33,20 @@ import numpy as np
 from dem import bodies, checks, quaternion
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.compiled import inlined, loop
+from dem.falls import DENSE, area, fall
 from dem.motion import Dynamic
 from dem.pairs import Pairs
+from dem.pressing import CHAINS, Pressing, pressing
 from dem.scene import Scene
 from dem.shapes import Plane, placed
 from dem.sources import bounds
 from dem.time_step import fastest_grain, fastest_tool
+from dem.time_step import recommended as recommended_step
 
-OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of a grain's radius
-CHAINS = 4.0  #: the strongest forces between grains over those that a like share of the weight makes
+OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of a grain's half thickness
+FALLEN = 0.005  #: the same for a moment, of a grain that has fallen
 RESISTS = 10.0  #: the strongest forces between grains that a tool pushes over those of a bed at rest
 STOPPED = 0.22  #: of v sqrt(m / k): how far a grain of speed v goes into a contact of this DAMPING
-DENSE = 0.64  #: solid fraction of a bed that sources may make
 TANGENTIAL = 2.0 / 7.0  #: k_t / k: both directions of an impact of spheres take as long (Silbert et al., PRE 64, 2001)
 DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed (Schwager, Poeschel); 1: 14 %
 
@@ -54,39 +56,47 @@ def pairs(scene: Scene) -> Pairs:
     return scene.pairs(recommended(scene))
 
 
-def recommended(scene: Scene, overlap: float = OVERLAP) -> float:
-    """The stiffness [N/m] with which no grain of a scene overlaps by more than this part of its radius, whether under
-    the weight of the bed above it, pushed by the fastest tool, or met by the fastest grain, to two digits; inf if there
-    is none of them.
+def recommended(scene: Scene) -> float:
+    """The stiffness [N/m] with which no grain of a scene overlaps by more than OVERLAP half thicknesses, whether under
+    the weight of the bed above it, pressed by a spring, a load, a motor or a tool, pushed by the fastest tool or met by
+    the fastest grain, nor by more than FALLEN of them after a fall, to two digits; inf if there is none of them.
 
     The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width, and
     four times as much where a chain of force goes (Radjai, Jean, Moreau, Roux, Phys. Rev. Lett. 77 (1996): a share of
     exp(-1.4 f) bears more than f times the mean). The stress that a periodic cell is to have takes the place of the
     weight over the area. Sources may fill the scene up to their height (`_bed`). Cohesion c presses grains together by
-    c / k. Grains that fall from high are not reckoned with.
+    c / k.
 
     A speed v that reaches a row of grains of mass m makes the force k d = v sqrt(k m), a wave along the row. A bed
     gives way to a tool before that: with at most RESISTS times the force of its weight (docs/mechanics.md), or with
-    that of the single grain that the tool throws.
+    that of the single grain that the tool throws. What has fallen (`dem.falls`) is stopped in a step of the time step
+    that the scene needs.
     """
-    grains = scene.expected()
-    allowed = overlap * bodies.bounding_radius(grains)
+    grains, pressed, dt = scene.expected(), pressing(scene), recommended_step(scene)
+    half = bodies.least_half_thickness(grains)
+    allowed = OVERLAP * half
     with np.errstate(over="ignore", invalid="ignore"):  # inf: rigid
         speeds = fastest_grain(scene), fastest_tool(scene)
         thrown, pushed = (grains.mass * (speed / allowed) ** 2 for speed in speeds)
-        stiffness = float(_strongest(_load(scene) / allowed, thrown, pushed, STOPPED**2).max())
+        needed = [_strongest(_load(scene, pressed) / allowed, thrown, pushed, STOPPED**2), pressed.force / allowed]
+        needed += [_stopping(*impact, dt, FALLEN * half) for impact in _impacts(scene, pressed, dt)]
+        stiffness = max(float(values.max()) for values in needed)
     return float(f"{stiffness:.1e}") if stiffness > 0.0 else np.inf  # the same on processors that round in other ways
 
 
-def expected_overlap(scene: Scene, stiffness: float) -> float:
-    """The greatest overlap, as a part of a radius, that `recommended` would expect of a stiffness [N/m]."""
-    grains = scene.expected()
+def expected_overlap(scene: Scene, stiffness: float, dt: float) -> float:
+    """The greatest overlap, as a part of a half thickness, that `recommended` would expect of a stiffness [N/m] in
+    steps of dt [s]."""
     if np.isinf(stiffness):
         return 0.0
+    grains, pressed = scene.expected(), pressing(scene)
     speeds = fastest_grain(scene), fastest_tool(scene)
     thrown, pushed = (speed * np.sqrt(grains.mass / stiffness) for speed in speeds)
-    overlaps = _strongest(_load(scene) / stiffness, thrown, pushed, STOPPED)
-    return float((overlaps / bodies.bounding_radius(grains)).max())
+    half = bodies.least_half_thickness(grains)
+    overlaps = [_strongest(_load(scene, pressed) / stiffness, thrown, pushed, STOPPED)]
+    overlaps.append(np.full(len(half), pressed.force / stiffness))
+    overlaps += [_stopped(*impact, dt, stiffness) for impact in _impacts(scene, pressed, dt)]
+    return max(float((values / half).max()) for values in overlaps)
 
 
 def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:
@@ -163,24 +173,65 @@ def _kept(stiffness, compliance, dt, held, impulse, c):
 
 @loop
 def spring_energies(
-    stiffness: Floats, compliance: Floats, dt: float, gap: Floats, after: Floats, held: Floats, impulse: Floats
-) -> tuple[float, float, float, float]:
+    stiffness: Floats, compliance: Floats, dt: float, past: Floats, gap: Floats, after: Floats, last: Floats,
+    held: Floats, impulse: Floats,
+) -> tuple[float, float, float, float]:  # fmt: skip
     """What contacts hold as springs at the start and at the end of a step, along the normals and then along the
     tangents [J]. Rigid ones hold nothing.
 
-    That is k/2 d^2 of an overlap d, of the gaps (nc,) at the start and `after` the step [m]; and h^2 / (2 k_t dt^2) of
-    the impulse h that a tangential spring holds, `held` (nc, 2) at the start."""
+    That is k/2 d^2 of an overlap d, of the `gap` (nc,) at the start and `after` the step, but of no more overlap than
+    the normal impulses of this step and of the `last` one (nc,), which began with the gaps `past` [m], make: what a
+    solver or the curves of surfaces leave beyond has done no work, and an implicit step does not give it back. And
+    h^2 / (2 k_t dt^2) of the impulse h that a tangential spring holds, `held` (nc, 2) at the start."""
     start, end, strained, strained_at_end = 0.0, 0.0, 0.0, 0.0
     for c in range(len(gap)):
         if np.isinf(stiffness[c]):
             continue
         k, per = stiffness[c], TANGENTIAL * stiffness[c] * dt**2
-        start += 0.5 * k * max(-gap[c], 0.0) ** 2
-        end += 0.5 * k * max(-after[c], 0.0) ** 2
+        start += 0.5 * k * _borne(k, compliance[c, 0], dt, past[c], gap[c], last[c]) ** 2
+        end += 0.5 * k * _borne(k, compliance[c, 0], dt, gap[c], after[c], impulse[c, 0]) ** 2
         one, other = _kept(stiffness, compliance, dt, held, impulse, c)
         strained += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / per
         strained_at_end += 0.5 * (one**2 + other**2) / per
     return start, end, strained, strained_at_end
+
+
+@inlined
+def _borne(stiffness, compliance, dt, begin, gap, impulse):
+    left = (1.0 - stiffness * dt**2 * compliance) * max(-begin, 0.0)  # of an overlap that no impulse has changed
+    return max(min(-gap, dt * compliance * impulse + left), 0.0)
+
+
+def _impacts(scene: Scene, pressed: Pressing, dt: float) -> list[tuple[Floats, float, float]]:
+    """What meets a body or the bed in steps of dt [s]: masses (n,) for the grains that stand for all, speed [m/s], and
+    how many layers of them come in a step."""
+    every, start = scene.expected(), fastest_grain(scene)
+    found = [(np.full(len(every), mass), speed, 1.0) for mass, speed in pressed.impacts]
+    for acceleration in pressed.accelerations:
+        last, block, gap, column = fall(scene, acceleration, start)
+        found.append((every.mass, last, 1.0))
+        if block > 0.0:
+            most = float((column * (2.0 * bodies.bounding_radius(every)) ** 2 / every.mass).max())
+            layers = min(most, block * dt / max(gap, 1e-300))
+            found.append((every.mass, block, max(layers, 1.0)))
+    return found
+
+
+def _stopping(mass: Floats, speed: float, layers: float, dt: float, allowed: Floats) -> Floats:
+    """The stiffness (n,) that stops these masses within the overlaps `allowed` (n,): the other way round as
+    `_stopped`."""
+    ways = layers * speed * dt / allowed
+    x = np.sqrt(np.maximum(4.0 - layers + ways, 0.0)) - 2.0
+    return mass * (np.where(x > 1.0, x, np.minimum(STOPPED * ways / layers, 1.0)) / dt) ** 2
+
+
+def _stopped(mass: Floats, speed: float, layers: float, dt: float, stiffness: float) -> Floats:
+    """How far (n,) masses (n,) that come with a speed go into a contact that stops them [m].
+
+    An implicit step that is long beside t = sqrt(m / k) stops so many layers within v dt / (1 + 4 x + x^2), x = dt / t,
+    of one layer; shorter ones resolve STOPPED of v t."""
+    x = dt * np.sqrt(stiffness / mass)
+    return speed * dt * np.where(x > 1.0, layers / (layers + 4.0 * x + x**2), STOPPED / x)
 
 
 def _strongest(weight: Floats, thrown: Floats, pushed: Floats, single: float) -> Floats:
@@ -191,7 +242,7 @@ def _strongest(weight: Floats, thrown: Floats, pushed: Floats, single: float) ->
     return strongest
 
 
-def _load(scene: Scene) -> Floats:
+def _load(scene: Scene, pressed: Pressing) -> Floats:
     """The weight that the whole bed, or the stress of the cell, would lay on each of the grains that stand for all, and
     the strongest cohesion (n,) [N]."""
     every, gravity = scene.expected(), math.hypot(*scene.gravity)
@@ -200,6 +251,9 @@ def _load(scene: Scene) -> Floats:
     if gravity > 0.0:
         down = np.asarray(scene.gravity) / gravity
         pressure = max(_pressure(scene, gravity, down), _bed(scene, gravity, down))
+    if scene.count:
+        sizes = [(float(np.linalg.norm(force)), force) for force in pressed.spread]
+        pressure += sum(size / area(scene, force / size) for size, force in sizes if size > 0.0)
     radius = bodies.bounding_radius(every)
     return np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * every.mass) + pull
 
@@ -209,14 +263,9 @@ def _pressure(scene: Scene, gravity: float, down: Floats) -> float:
     grains = scene.survey()
     if not grains.count:
         return 0.0
-    across = np.eye(3) - np.outer(down, down)
-    spread = across @ grains.spread @ across / grains.count
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(spread), 0.0))[1:]  # in the plane across
-    radius = grains.radius / grains.count
-    width = np.sqrt(12.0) * spread + 2.0 * radius  # of a rectangle of that spread, with the grains at its edges
     free = [(body.mass, body.motion) for body in scene.large_bodies if isinstance(body.motion, Dynamic)]
     others = sum(mass * float(down @ motion.free_directions() @ down) for mass, motion in free)  # the rest is borne
-    return float(gravity * (grains.mass + others) / width.prod())
+    return gravity * (grains.mass + others) / area(scene, down)
 
 
 def _bed(scene: Scene, gravity: float, down: Floats) -> float:

@@ -23,11 +23,15 @@ class Survey:
     """Of some grains."""
 
     count: int
-    extremes: Bodies  #: the smallest and largest, the heaviest over its radius and over its square, and the fastest
+    #: the thinnest, the widest over its half thickness, the heaviest over this and over its square, and those that go
+    #: and turn fastest
+    extremes: Bodies
     mass: float  #: sum [kg]
     radius: float  #: sum of the radii of the spheres about them [m]
     centre: Floats  #: (3,) mean of the positions [m]
     spread: Floats  #: (3, 3) sum of (x - centre) (x - centre)' [m^2]
+    low: Floats  #: (3,) corner of the box about the positions [m]
+    high: Floats  #: (3,) the other one [m]
 
 
 def survey(
@@ -48,21 +52,24 @@ def survey(
 def _of(grains: Bodies, speed: Callable[[Bodies], Floats]) -> Survey:
     centre = grains.position.mean(axis=0)
     way, radius = grains.position - centre, bodies.bounding_radius(grains)
+    sums, place = (float(grains.mass.sum()), float(radius.sum())), grains.position
     return Survey(
-        len(grains), _extremes(grains, speed), float(grains.mass.sum()), float(radius.sum()), centre, way.T @ way
+        len(grains), _extremes(grains, speed), *sums, centre, way.T @ way, place.min(axis=0), place.max(axis=0)
     )
 
 
 def _extremes(grains: Bodies, speed: Callable[[Bodies], Floats]) -> Bodies:
-    radius = bodies.bounding_radius(grains)
+    radius, half = bodies.bounding_radius(grains), bodies.least_half_thickness(grains)
     with np.errstate(over="ignore", divide="ignore"):
-        tests = (-radius, radius, grains.mass / radius, grains.mass / radius**2, speed(grains))
+        heavy = grains.mass / half, grains.mass / half**2
+        tests = (-half, radius * (radius / half), *heavy, speed(grains), bodies.turning(grains))
     return grains.take(np.array([np.argmax(values) for values in tests]))
 
 
 def _together(parts: Iterable[Survey], speed: Callable[[Bodies], Floats]) -> Survey:
     """Of the grains of all parts, which is empty without parts (Chan, Golub, LeVeque, Am. Stat. 37 (1983))."""
-    whole = Survey(0, bodies.none(), 0.0, 0.0, np.zeros(3), np.zeros((3, 3)))
+    none = np.full(3, np.inf)
+    whole = Survey(0, bodies.none(), 0.0, 0.0, np.zeros(3), np.zeros((3, 3)), none, -none)
     for part in parts:
         count, way = whole.count + part.count, part.centre - whole.centre
         whole = Survey(
@@ -72,5 +79,7 @@ def _together(parts: Iterable[Survey], speed: Callable[[Bodies], Floats]) -> Sur
             whole.radius + part.radius,
             whole.centre + part.count / count * way,
             whole.spread + part.spread + whole.count * part.count / count * np.outer(way, way),
+            np.minimum(whole.low, part.low),
+            np.maximum(whole.high, part.high),
         )
     return whole

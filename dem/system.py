@@ -43,11 +43,12 @@ from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
 from dem.contact_map.loops import closing, scale
 from dem.contact_map.map import packed
+from dem.free_motion import kept_spin
 from dem.joints import Coupling
 from dem.rolling import resistance
 from dem.servo import cell_of
 from dem.surface import surface_velocities
-from dem.world import World
+from dem.world import World, turns_unlike_spheres
 
 
 class ContactSystem:
@@ -60,7 +61,8 @@ class ContactSystem:
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
         spring; 0: rigid [1/kg]
-        held (nc, 2): what tangential springs hold at the start of the step, from `take_hold` [N s]
+        last (nc,), held (nc, 2): the normal impulses of the last step, and what tangential springs hold at the start of
+        this one, from `take_hold` [N s]
         cell: its part in the step, a `dem.contact_map.cell.Cell`; None where its size is constant
         drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
         last step, in a cell that deforms [m/s]
@@ -72,6 +74,9 @@ class ContactSystem:
         problem_map: G of the cone problem: with the rows of turning, where contacts resist it
         free_velocity (owned, 6): velocities without contacts, but with their attraction
         free_large (large, 6): the same of the large bodies, without attraction, on all ranks
+        push (owned, 6): mass-scaled momenta that contacts are expected to give; None if all bodies turn as spheres do
+        middle (owned, 3): the angular velocities about which those of the step are linear in the impulses, see
+        `dem.free_motion.free_spin`, or None
         resistance: the rows of `dem.rolling`, or None
         attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.cohesion`
         drives: of the large bodies, the same on all ranks
@@ -81,10 +86,12 @@ class ContactSystem:
 
     def __init__(
         self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf,
-        joints: Coupling | None = None, spent: Ints | None = None,
+        joints: Coupling | None = None, spent: Ints | None = None, expected: Floats | None = None,
+        push: Floats | None = None,
     ) -> None:  # fmt: skip
         """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `joints`,
-        `spent`: the joints of this step, and what `Drives` has by that name, if contacts have shown them."""
+        `spent`: the joints of this step, and what `Drives` has by that name, if contacts have shown them. `expected`:
+        impulses (nc, 3) that the contacts are expected to have, as those of the last step; or `push` if it is known."""
         positive("time step", dt)
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
@@ -104,15 +111,28 @@ class ContactSystem:
         owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
         halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
         self.contact_map = ContactMap(world.comm, rows, halo, row)
-        free = free_velocities(world, near, dt, self.drives)
+        self.attraction = attraction(world, contacts, dt)
+        self.push = push
+        if self.push is None and turns_unlike_spheres(world):
+            impulse = np.zeros((len(contacts), 3)) if expected is None else expected[: len(contacts)]
+            self.push = self.contact_map.momenta(self.net(impulse))
+        change = None
+        if self.push is not None:
+            change = np.empty_like(self.push)
+            scale(self.contact_map.given.root, self.push, change)
+        free, self.middle = free_velocities(world, near, dt, self.drives, change)
         self.applied = applied_impulses(world, dt) if world.loaded else None
-        if world.loaded:
+        if world.loaded or change is not None:
             halo.update(free)
         freely, rounding = closing(rows.frame, arm, row, free)
-        self.joints = joint_coupling(world, dt) if joints is None else joints
+        self.joints = joint_coupling(world, dt, self.push) if joints is None else joints
         if self.joints is not None:
             here, slot = slots(world, near.bodies.id)
+            spin = self.joints.spin[slot]
+            free[here, 3:] = np.where(np.isnan(spin), free[here, 3:], spin)
             free[here] += self.joints.change[slot]
+            if self.middle is not None:
+                self.middle[here[here < owned]] = self.joints.middle[slot[here < owned]]
             freely, more = closing(rows.frame, arm, row, free)
             rounding += more
             own = here < owned
@@ -122,7 +142,7 @@ class ContactSystem:
         self.free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
         self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
-        self.held = np.zeros((len(contacts), 2))
+        self.last, self.held = np.zeros(len(contacts)), np.zeros((len(contacts), 2))
         self.surface = surface_velocities(world, contacts, self.frame)
         if self.surface is not None:
             self.b[:, 1:] = self.surface
@@ -134,7 +154,6 @@ class ContactSystem:
         if contacts.drift is not None:
             freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
         self._attracted: Floats | float = 0.0  #: mass-scaled momenta of the attraction
-        self.attraction = attraction(world, contacts, dt)
         if self.attraction is not None:
             self._attracted = momentum = self.contact_map.momenta(along_normal(-self.attraction))
             self.free_velocity = self.velocity_with(momentum)
@@ -171,21 +190,28 @@ class ContactSystem:
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 
-    def take_hold(self, held: Floats) -> None:
-        """Let tangential springs begin with what they held at the end of the last step (nc, 2), in the frames of this
-        one [N s]."""
-        self.held = held
-        stiffness.pull_back(self.r, self.compliance, held)
+    def take_hold(self, last: Floats) -> None:
+        """Let springs begin with what they held at the end of the last step (nc, 3), as `held_after` gave it, in the
+        frames of this one [N s]."""
+        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
+        stiffness.pull_back(self.r, self.compliance, self.held)
 
     def held_after(self, impulse: Floats) -> Floats:
         """Impulses of the step (parts nc, 3), see `dem.pairs.Pairs.parts`, with what tangential springs hold at its end
         in the place of the tangential ones [N s]."""
         return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
 
-    def spring_energies(self, gap: Floats, after: Floats, impulse: Floats) -> tuple[float, float, float, float]:
-        """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3)."""
-        given = self.stiffness, self.compliance, self.dt
-        return stiffness.spring_energies(*given, gap, after, self.held, impulse)
+    def spring_energies(
+        self, contacts: Contacts, before: Floats, opening: Floats, impulse: Floats
+    ) -> tuple[float, float, float, float]:
+        """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3) in the friction cones, and the normal
+        velocities `opening` (nc,) of its end; `before` (rows, 6) are the velocities before it."""
+        came = self.contact_map.relative_velocities(before)[:, 0]
+        if self.drift is not None:
+            came = came + self.drift[:, 0]
+        gaps = contacts.gap - self.dt * came, contacts.gap, contacts.linear_gap + self.dt * opening
+        held = self.last, self.held, impulse
+        return stiffness.spring_energies(self.stiffness, self.compliance, self.dt, *gaps, *held)
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
@@ -202,6 +228,18 @@ class ContactSystem:
             momentum = self.contact_map.coupled(momentum)
         scale(self.contact_map.given.root, momentum, change)
         return self.free_velocity + change
+
+    def kept(self, world: World, velocity: Floats) -> Floats:
+        """The velocities (owned, 6) with which bodies go into the next step, where those of this one are `velocity`:
+        the same but of bodies that are no spheres, see `dem.free_motion.kept_spin`."""
+        if self.middle is None:
+            return velocity
+        own = self.near.bodies.take(slice(len(velocity)))
+        out = velocity.copy()
+        rows = np.flatnonzero(np.isfinite(self.middle[:, 0]))
+        spins = velocity[rows, 3:], self.middle[rows]
+        out[rows, 3:] = kept_spin(own.quaternion[rows], *spins, own.inertia[rows], self.dt)
+        return out
 
     def set_rate(self, world: World, momentum: Floats) -> None:
         """Give a cell that deforms the rate of its periods in this step, for the momenta of `velocity_with`;

@@ -1,7 +1,8 @@
 """The time step and the contact distance that a scene needs, from its sizes and speeds.
 
-Two times matter: that in which the fastest tool goes a radius, and that in which a grain falls about half of one,
-sqrt(R / g). docs/mechanics.md has the errors of forces on tools over dt.
+Three times matter: that in which the fastest tool goes a radius, that in which a grain falls about half of one,
+sqrt(R / g), and that in which a body that is no sphere turns by a radian. docs/mechanics.md has the errors of forces on
+tools over dt.
 """
 
 from __future__ import annotations
@@ -13,20 +14,65 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Floats
 from dem.contact.primitives import extents
+from dem.falls import fall
 from dem.motion import top_speed
+from dem.pressing import Pressing, pressing
 from dem.scene import LargeBody, Scene
 from dem.shapes import Plane
+from dem.turns import TURN, turning_of_large
 
 DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/mechanics.md has the errors of forces
 FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
+FALLS = 1.5  #: the way in a step, in radii, of a grain that has fallen; two are the limit of `dem.fast`
+SPRINGS = 0.2  #: the step times the highest frequency of springs; 2 is their limit
 PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same and steps take a quarter longer
 
 
 def recommended(scene: Scene) -> float:
-    """The time step [s] with which forces on tools are within a few per cent of those of smaller steps, to two digits;
-    0.01 s for a scene without tools and gravity."""
-    speed, lasting = fastest(scene), for_settling(scene)
-    return min(lasting, _rounded(DRIVEN * smallest(scene) / speed)) if speed > 0.0 else lasting
+    """The time step [s] with which forces on tools are within a few per cent of those of smaller steps, grains that
+    fall go no further than FALLS of their half thicknesses, and bodies that are no spheres turn by no more than TURN at
+    time zero, to two digits; 0.01 s for a scene without all that."""
+    return min(needs(scene).values())
+
+
+def needs(scene: Scene) -> dict[str, float]:
+    """The time steps [s] that a scene needs, by what needs them."""
+    found = {"grains that come to rest": for_settling(scene)}
+    speed, pressed = fastest(scene), pressing(scene)
+    pushed = max(float(np.linalg.norm(acceleration)) for acceleration in pressed.accelerations)
+    falls = max([falling(scene, pressed), *(speed for _, speed in pressed.impacts)])
+    if speed > 0.0:
+        found[f"what moves at {speed:.3g} m/s"] = _rounded(DRIVEN * smallest(scene) / speed)
+    if falls > 0.0:
+        found[f"falls to {falls:.3g} m/s"] = _rounded(FALLS * smallest(scene) / falls)
+    if pushed > math.hypot(*scene.gravity):
+        found[f"loads of {pushed:.3g} m/s^2"] = _rounded(FALLING * math.sqrt(smallest(scene) / pushed))
+    if (spin := fastest_turn(scene)) > 0.0:
+        found[f"bodies that turn at {spin:.3g} rad/s"] = _rounded(TURN / spin)
+    if pressed.highest > 0.0:
+        found[f"springs of {pressed.highest:.3g} rad/s"] = _rounded(SPRINGS / pressed.highest)
+    return found
+
+
+def reason(scene: Scene) -> str:
+    """What the recommended time step is for."""
+    found = needs(scene)
+    return min(found, key=lambda name: found[name])
+
+
+def fall_remark(scene: Scene, dt: float) -> str:
+    """What to say of a dt [s] in which grains that fall go so far that `dem.fast` may end the run; empty if none do."""
+    speed, size = falling(scene, pressing(scene)), smallest(scene)
+    if dt * speed <= 2.0 * size:
+        return ""
+    most = _rounded(FALLS * size / speed)
+    return f"dt {dt:g} s is too large: falls lead to {speed:.3g} m/s, further than two radii in a step; take {most:g} s"
+
+
+def falling(scene: Scene, pressed: Pressing) -> float:
+    """The greatest speed with which a grain may meet a body or the bed, by gravity and loads [m/s]."""
+    start = fastest_grain(scene)
+    return max(fall(scene, acceleration, start).last for acceleration in pressed.accelerations)
 
 
 def for_settling(scene: Scene) -> float:
@@ -41,9 +87,9 @@ def contact_distance(scene: Scene) -> float:
 
 
 def smallest(scene: Scene) -> float:
-    """Radius of the smallest grain [m]; 0.1 m if there is none."""
-    radii: Floats = bodies.bounding_radius(scene.expected())
-    return float(radii.min()) if len(radii) else 0.1
+    """Half thickness of the thinnest grain [m]; 0.1 m if there is none."""
+    half: Floats = bodies.least_half_thickness(scene.expected())
+    return float(half.min()) if len(half) else 0.1
 
 
 def fastest(scene: Scene) -> float:
@@ -59,6 +105,12 @@ def fastest_tool(scene: Scene) -> float:
 def fastest_grain(scene: Scene) -> float:
     """The greatest speed of a grain at time zero [m/s]; in a sheared cell beside the flow."""
     return float(scene.speeds(scene.expected()).max(initial=0.0))
+
+
+def fastest_turn(scene: Scene) -> float:
+    """The greatest angular speed at time zero of a body that is no sphere and that forces move [rad/s]."""
+    grains, large = bodies.turning(scene.expected()), turning_of_large(scene.large(), scene.large_bodies)
+    return float(np.concatenate([grains, large]).max(initial=0.0))
 
 
 def _fall(scene: Scene) -> float:

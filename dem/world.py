@@ -248,6 +248,11 @@ class World:
         }
 
 
+def turns_unlike_spheres(world: World) -> bool:
+    """Whether a body that turns freely may do so in another way than a sphere; the same on all ranks."""
+    return not world.only_spheres or bool(np.isfinite(world.large.inertia).all(axis=1).any())
+
+
 def set_motion(world: World, name: str, motion: Motion | None = None, **values: Any) -> None:
     """Give a large body another motion, or its own one with other `values` as of `changed`; it begins where it is now.
     ValueError for one that it cannot have: if forces move the body, they go on doing so along the same line or about

@@ -20,6 +20,7 @@ from mpi4py import MPI
 from dem import measures
 from dem.arrays import Floats
 from dem.measures import Fields, Sample
+from dem.measures.images import nearest_image
 from dem.mesh import Mesh
 from pctt.disk import hdf5, whole
 from pctt.folder import Folder
@@ -29,14 +30,19 @@ def sample(folder: Folder, step: int) -> Sample:
     """All grains and contacts of a recorded step. FileError if there is no such step, or if its file is damaged.
 
     The centres at the start of the step are those of the record less dt times the velocities; that is exact but for
-    bodies with a prescribed motion that turns."""
+    bodies with a prescribed motion that turns. A cell that deforms is taken back with them."""
     folder.require_frames()
     frame = folder.frame(step)
     table, grains = frame.table, slice(frame.table.grains)
     contacts = frame.contacts
-    center = (frame.position - contacts.dt * frame.velocity[:, :3])[contacts.bodies]
+    stretch = 1.0 + contacts.dt * frame.rate
+    center = ((frame.position - contacts.dt * frame.velocity[:, :3]) / stretch)[contacts.bodies]
     if contacts.moved is not None:
         center[:, 1] += contacts.moved
+    row, side = np.nonzero(contacts.bodies < table.grains)  # points and grains were put into the cell each by itself
+    point = contacts.point[row]
+    lattice = frame.lattice / stretch - contacts.dt * frame.drift / stretch[:, None]
+    center[row, side] = point + nearest_image(center[row, side] - point, lattice)
     return Sample(
         comm=MPI.COMM_SELF,
         count=table.grains,
@@ -55,6 +61,8 @@ def sample(folder: Folder, step: int) -> Sample:
         gap=contacts.gap,
         force=contacts.force,
         moment=contacts.moment,
+        lattice=frame.lattice,
+        drift=frame.drift,
     )
 
 

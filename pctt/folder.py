@@ -22,7 +22,7 @@ import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,8 @@ FILES = (*RUN_FILES, "frames", HARD)
 
 CONTENTS = (
     "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
+    "attributes of a periodic cell: lattice m, the ways to the next images along each axis, drift m/s, their "
+    "velocities, and rate 1/s, with which the periods grew; "
     "record: attributes as in records.csv; "
     "contact: bodies a and b, point m as seen from a, moved m from b to where it is as seen from a, "
     "frame rows (normal from a to b, t1, t2), gap m, "
@@ -161,6 +163,10 @@ class Frame:
     velocity: np.ndarray  #: (n, 6) linear [m/s] and angular [rad/s]
     contacts: Contacts  #: their bodies are rows
     table: Table  #: what the bodies are
+    #: (3, 3) ways to the next images along each axis [m], and their velocities [m/s]; 0: no period, or an older file
+    lattice: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    drift: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    rate: np.ndarray = field(default_factory=lambda: np.zeros(3))  #: (3,) with which periods grew in the step [1/s]
 
     @property
     def speed(self) -> np.ndarray:
@@ -279,7 +285,8 @@ class Folder:
             else:
                 table = self.table
             contacts = Contacts(*rows, float(contact.attrs["dt"]), moment, moved)  # type: ignore[call-arg]
-            return Frame(step, float(file.attrs["time"]), **places, contacts=contacts, table=table)
+            cell = {name: file.attrs[name] for name in ("lattice", "drift", "rate") if name in file.attrs}
+            return Frame(step, float(file.attrs["time"]), **places, contacts=contacts, table=table, **cell)
 
         return disk.read(self.frame_path(step), MPI.COMM_SELF, take)
 

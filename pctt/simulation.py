@@ -40,8 +40,9 @@ from dem.sources import Tally
 from dem.springs import Spring
 from dem.start import step_remark
 from dem.step import Step
-from dem.stiffness import expected_overlap
+from dem.time_step import fall_remark, reason
 from dem.together import meet, together
+from dem.turns import TurnWatch
 from dem.world import (
     set_load,
     set_motion,
@@ -62,6 +63,7 @@ from pctt.run import report, state
 from pctt.run.dump import Dump
 from pctt.run.joints import JointNow
 from pctt.run.output import Place, Writer, described_bodies, described_forms, refuse_unwritable
+from pctt.run.overlaps import OverlapWatch
 from pctt.run.settings import Run, Settings, scene_name
 from pctt.run.stepper import NoSolutionError, Stepper
 
@@ -75,7 +77,8 @@ class Simulation:
     settings : the `Settings`, with what the scene and the solver have of their own filled in
     experiment : the scene as an `Experiment`
     world : the bodies of this rank and the time, a `dem.world.World`
-    expected_overlap : the greatest to expect of the contacts' stiffness, as a part of a radius; 0 of rigid contacts
+    overlap_watch : what overlaps are to be expected, and what makes the worst, a `pctt.run.overlaps.OverlapWatch`
+    dt_reason : what dt was chosen for; empty if it was given
     memory, stepper : the impulses of the last step, and what makes the next, a `pctt.run.stepper.Stepper`
     last : the last step, a `dem.step.Step` with this rank's contacts and impulses; None before the first
     figures : of the last step, as in steps.jsonl and records.csv: ``iterations``, ``natural_residual``, ``converged``,
@@ -92,13 +95,15 @@ class Simulation:
         restart: str | Path = "",
         compare: ccp.Comparison | None = None,
         say: Callable[[str], object] = print,
+        program: bool = False,
         **changes: Any,
     ):
         """The scene at time zero, or as the checkpoint ``restart`` has it; "settled": in its settled state, which is
         made at first use.
 
         The settings may be given one by one, as ``dt=0.01, solver="apgd", tol=1e-5``. ``compare`` solves the Newton
-        systems with other preconditioners too; ``say`` is told on the first rank how a settling goes on. Raises
+        systems with other preconditioners too; ``say`` is told on the first rank how a settling goes on; ``program``:
+        warnings name options as ``python -m pctt.run`` does. Raises
         OptionError (a ValueError) for a bad setting, SceneError if the scene fails, and FileError for a bad file, each
         on all ranks. Warns of a checkpoint of another text of the scene file, or of other surfaces of bodies.
         """
@@ -113,6 +118,7 @@ class Simulation:
             comm, "settings", lambda: made(Settings, given).of(self.experiment, compared), own=(OptionError,)
         )
         scene = state.built(self.experiment, comm)
+        self.dt_reason = reason(scene) if self.settings.dt is None else ""
         self.settings = self.settings.fitted(scene, compared)
         if restart == "settled":
             restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
@@ -122,12 +128,17 @@ class Simulation:
         else:
             self.world = state.world_at_start(self.experiment, scene, comm)
             self.memory = ImpulseMemory(comm, self.world.pairs.parts)
-        if large := step_remark(self.world, self.settings.dt):
+        falls = "" if restart else comm.bcast(fall_remark(scene, self.settings.dt))
+        if large := step_remark(self.world, self.settings.dt) or falls:
             warn(comm, large)
+        self._turns = TurnWatch()
+        self._tell_turns()
         self.restart = str(restart)  #: the file from which it goes on
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
-        self.expected_overlap = expected_overlap(scene, float(self.world.pairs.stiffness.min()))
+        watch = OverlapWatch(scene, self.settings, float(self.world.pairs.stiffness.min()))
+        self.overlap_watch = comm.bcast(watch)  # processors may round in other ways
+        self._program, self._jumped = program, False
         self.last: Step | None = None
         self.figures: dict[str, Any] = {}
         self.output: Writer | None = None
@@ -173,9 +184,18 @@ class Simulation:
             with log.phase("output"):
                 output.add(figures, self._row)
         self.figures = self._row | figures
-        if figures["energy_jump"]:
-            warn(self.comm, report.jump_words(self.figures))
+        if figures["energy_jump"] and not self._jumped:
+            self._jumped = True
+            warn(self.comm, report.jump_words(self.figures, self._program))
+        if cause := self.overlap_watch.look(self.last, figures["closing_speed"]):
+            warn(self.comm, self.overlap_watch.words(cause, self.steps, self._program))
+        self._tell_turns()
         return self.figures
+
+    def _tell_turns(self) -> None:
+        """Warn of a body that turns too far in a step; collective."""
+        if words := self._turns.look(self.world, self.settings.dt):
+            warn(self.comm, words)
 
     def run(
         self,
@@ -215,6 +235,12 @@ class Simulation:
     def time(self) -> float:
         """[s]; not collective."""
         return self.world.time
+
+    @property
+    def expected_overlap(self) -> float:
+        """The greatest to expect of the contacts as springs, as a part of a half thickness; 0 of rigid contacts. Not
+        collective."""
+        return self.overlap_watch.springs
 
     @property
     def steps(self) -> int:
@@ -300,7 +326,7 @@ class Simulation:
             "contacts",
             key=own.key,
             bodies=np.searchsorted(np.append(self.ids, self.world.large.id), np.stack([id[own.a], id[own.b]], axis=1)),
-            point=wrapped(own.point, self.world.period, self.world.shear),
+            point=step.point,
             frame=step.system.frame,
             gap=own.gap,
             moved=np.zeros_like(own.point) if own.moved is None else own.moved,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -39,20 +40,65 @@ def test_pages_name_studies_that_there_are():
             assert (ROOT / "run" / name).exists() or (ROOT / "pctt" / "run" / name).exists(), f"{page}: run/{name}"
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "trains ranks 1 -caps 10 -every 12",
-        "trains reuse 1 -steps 2",
-        "trains scaling 1",
-        "ranks unfoldings 1",
-    ],
-)
+QUICK = ["trains ranks 1 -caps 10 -every 12", "trains reuse 1 -steps 2", "trains scaling 1", "ranks unfoldings 1"]
+
+
+@pytest.mark.parametrize("words", QUICK)
 def test_a_study_of_the_smallest_size_runs(words, tmp_path):
     name, *rest = words.split()
     done = subprocess.run([sys.executable, STUDIES / f"{name}.py", *rest], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert list((tmp_path / "results").glob(f"{name}*.json"))
+
+
+#: Every other study at a small size, but those of other programs, which have to be there, and `convert_problems`, whose
+#: files tests/ccp/test_convert_problems.py has.
+SMALL = [
+    "measure steps 1", "measure preconditioners 1 -every 8 -names pbjacobi,tt", "measure laws 1", "measure paper -n 1",
+    "measure pdip -n 1", "time_steps mixer4 --starts 1 --settings 6", "windows shear4 --states 1 --settings default "
+    "--small dt=.005,tol=1e-3", "profile_problems tests/ccp/hard apgd conic --seconds 2 --laws convex",
+    "cluster_model 2 -sizes 1,2 -copies 2,1,1", "cluster_start 12 -ranks 4 -of 0,3 -real 8 -steps 1",
+    "validate closed_forms", "seeds 1,2 -scene plane_shear -seconds 0.02", "h_stop 2 --rate 40",
+    "features loads --steps 1 --rounds 1", "shapes -n 3 -steps 5 -shapes spheres,cubes",
+    "torture plant cell -n 2 -kills 3 -steps 20", "structure run", "sparse -names pbjacobi",
+    "ranks functions", "kernels -only imq1 -ways auto plain", "table_plots",
+    "pictures incline -n 2",
+]  # fmt: skip
+ELSEWHERE = {"compare_chrono", "compare_liggghts", "convert_problems"}
+DRAWS = {"structure": "matplotlib", "table_plots": "matplotlib", "pictures": "vtkmodules"}  # and nothing else
+
+
+def test_the_small_studies_are_all():
+    files = {name for name in re.findall(r"^\| `([a-z_]+)", PAGE, re.MULTILINE)}
+    assert files - ELSEWHERE == {words.split()[0] for words in QUICK + SMALL}
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory):
+    """A checkout whose docs and results may change, with the environment and a small run of this one."""
+    if not (ROOT / ".venv/bin/mpiexec").exists():
+        pytest.skip("no .venv: run/setup makes it")
+    place = tmp_path_factory.mktemp("checkout")
+    for name in (".venv", "pctt", "dem", "tests", "README.md", "pyproject.toml"):
+        (place / name).symlink_to(ROOT / name)
+    for name in ("run", "docs"):
+        shutil.copytree(ROOT / name, place / name)
+    words = ["-m", "pctt.run", "-scene", "mixer", "-scene_n", "1", "-steps", "30", "-output", "run-1", "-quiet"]
+    subprocess.run([place / ".venv/bin/python", *words], cwd=place, check=True)
+    return place
+
+
+@pytest.mark.slow
+@pytest.mark.mpi
+@pytest.mark.parametrize("words", SMALL)
+def test_every_study_runs(words, copy):
+    name, *rest = words.replace(" run", " run-1").split()
+    if name in DRAWS:
+        pytest.importorskip(DRAWS[name], reason=f"run/study {name} installs it")
+    command = [copy / ".venv/bin/python", copy / "run" / "studies" / f"{name}.py", *rest]
+    done = subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
+    assert done.stdout.strip()
 
 
 def test_the_ranks_of_unfoldings_are_those_of_the_train_that_svd_makes(monkeypatch):

@@ -10,6 +10,7 @@ of the last rank.
 from __future__ import annotations
 
 import copy
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from mpi4py import MPI
 from dem.arrays import Floats, Ints
 from dem.compiled import loop
 from dem.contact_map.map import BlockRows, ContactMap, shaped
+from dem.exchange import offsets
 
 
 class Cell(NamedTuple):
@@ -29,12 +31,12 @@ class Cell(NamedTuple):
 
 
 class CellMap(ContactMap):
-    """A `ContactMap` with the columns of a cell, for methods that need products alone.
+    """A `ContactMap` with the columns of a cell.
 
     free : the map without the cell; it may have rows of turning, which the cell does not touch
     """
 
-    has_rows = False
+    couples = True
 
     def __init__(self, free: ContactMap, cell: Cell):
         self.comm, self.given, self.halo, self.body = free.comm, free.given, free.halo, free.body
@@ -50,6 +52,7 @@ class CellMap(ContactMap):
         other = copy.copy(self)
         other.free, other._lever = self.free.only(contacts), np.take(self._lever, contacts, axis=0)
         other.rows, other._count = other.free.rows, len(contacts)
+        other.__dict__.pop("block_rows", None)
         return other
 
     def push(self, g: Floats) -> Floats:
@@ -134,10 +137,17 @@ class CellMap(ContactMap):
         lever = (self.cell.lever.reshape(-1, 3, 3) * size[: self._count, :, None]).reshape(-1, 9)
         return CellMap(self.free.scaled(size, precision), self.cell._replace(lever=lever))
 
-    @property
-    def block_rows(self) -> BlockRows:  # type: ignore[override]
-        """The cell would fill the rows; ValueError."""
-        raise ValueError("a contact map with a cell has no sparse rows: allowed are methods that need products alone")
+    @cached_property
+    def block_rows(self) -> BlockRows:
+        """The rows of the map without the cell, with a block of the cell for each contact; collective at its first
+        use."""
+        free, count = self.free.block_rows, self._count
+        blocks = np.zeros((count, 3, 6))
+        blocks[:, :, :3] = self._lever.reshape(-1, 3, 3) * self.cell.root
+        ends, last = free.indptr[1 : count + 1], offsets(self.comm, self.columns)[-1] - 1
+        indptr = free.indptr + np.minimum(np.arange(len(free.indptr)), count)
+        indices, blocks = np.insert(free.indices, ends, last), np.insert(free.blocks, ends, blocks, axis=0)
+        return BlockRows(indptr, indices, blocks, self.columns)
 
 
 @loop

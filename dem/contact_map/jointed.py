@@ -8,23 +8,28 @@ of joints have no sign and need no cone; what is left is the same cone problem o
 from __future__ import annotations
 
 import copy
+from functools import cached_property
 
 import numpy as np
+import scipy.sparse as sp
 from mpi4py import MPI
 
 from dem.arrays import Floats, Ints
 from dem.contact_map.map import BlockRows, ContactMap, shaped
+from dem.exchange import offsets
+
+ROUNDING = 1e-14  # of the coupling of bodies that no chain of joints joins
 
 
 class JointedMap(ContactMap):
-    """A `ContactMap` with the coupling of joints, for methods that need products alone.
+    """A `ContactMap` with the coupling of joints. Its products are those of contacts, and of K.
 
     here, slot : own rows of jointed bodies, and their places among all of these
     coupling : K (6 n, 6 n) of the n jointed bodies, the same on all ranks
     free : the map without joints, perhaps with moments
     """
 
-    has_rows = False
+    couples = True
 
     def __init__(self, known: ContactMap, here: Ints, slot: Ints, coupling: Floats):
         super().__init__(known.comm, known.given, known.halo, known.body, known.precision)
@@ -34,6 +39,7 @@ class JointedMap(ContactMap):
         other = copy.copy(self)
         other.free = self.free.only(contacts)
         other.rows = other.free.rows
+        other.__dict__.pop("block_rows", None)
         return other
 
     def gathered(self, v: Floats) -> Floats:
@@ -92,7 +98,20 @@ class JointedMap(ContactMap):
         """The map with its rows multiplied by ``size`` (rows, 3)."""
         return self.of(self.free.scaled(size, precision))
 
-    @property
-    def block_rows(self) -> BlockRows:  # type: ignore[override]
-        """Joints would fill the rows; ValueError."""
-        raise ValueError("a contact map with joints has no sparse rows: allowed are methods that need products alone")
+    @cached_property
+    def block_rows(self) -> BlockRows:
+        """The rows of G R: contacts of a jointed body have a block for each body that joints join it with; collective
+        at its first use."""
+        free, number = self.free.block_rows, np.zeros(len(self._coupling) // 6, np.int64)
+        number[self._slot] = offsets(self.comm, self.columns)[self.comm.rank] + self._here
+        self.comm.Allreduce(MPI.IN_PLACE, number)
+        bodies, place = np.unique(np.concatenate([free.indices, number]), return_inverse=True)
+        size, place = 6 * len(bodies), place.ravel()
+        jointed = (6 * place[len(free.indices) :, None] + np.arange(6)).ravel()
+        row, column = np.nonzero(np.abs(self._coupling) > ROUNDING)
+        K = sp.csr_matrix((self._coupling[row, column], (jointed[row], jointed[column])), shape=(size, size))
+        R = (sp.identity(size, format="csr") - K).tobsr((6, 6))
+        G = sp.bsr_matrix((free.blocks, place[: len(free.indices)], free.indptr), shape=(3 * free.rows, size))
+        rows = (G @ R).tobsr((3, 6))
+        rows.sort_indices()
+        return BlockRows(rows.indptr.astype(np.int64), bodies[rows.indices], rows.data, self.columns)

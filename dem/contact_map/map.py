@@ -111,7 +111,7 @@ class ContactMap:
     precision : of the arrays that products take and return; single precision moves half of the bytes
     """
 
-    has_rows = True  #: whether `block_rows` can have it, else it is for methods that need products alone
+    couples = False  #: whether more than contacts couples bodies: Newton systems then take its `block_rows`
     has_parts = True  #: whether it has `only`
 
     def __init__(

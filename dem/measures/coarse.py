@@ -10,12 +10,13 @@ import numpy as np
 from dem.arrays import Floats
 from dem.checks import positive
 from dem.compiled import loop
-from dem.measures.grains import ends
+from dem.measures.grains import branches, ends
 from dem.measures.region import Block
 from dem.measures.sample import Sample, summed
 
 #: The functions W of `fields`.
 KERNELS = ("gauss", "lucy")
+CUT = 3.0  #: standard deviations at which "gauss" ends
 
 
 class Fields(NamedTuple):
@@ -40,18 +41,20 @@ def fields(sample: Sample, region: Block, cells: Sequence[int], width: float, ke
     positive("width of the kernel", width)
     if kernel not in KERNELS:
         raise ValueError(f"kernel {kernel!r}: allowed is one of {', '.join(KERNELS)}")
-    low, shape = np.array(region.low, float), np.array(cells, np.int64)
-    spacing = (np.array(region.high) - low) / shape
-    mass, v, grid = sample.mass[:, None], sample.velocity[:, :3], (low, spacing, shape, float(width), kernel == "gauss")
+    (low, high), shape, gauss = region.bounds, np.array(cells, np.int64), kernel == "gauss"
+    spacing, reach = (high - low) / shape, float(width) * (CUT if gauss else 1.0)
+    grid = low, spacing, shape, float(width), gauss
+    row, place, v = sample.grains_in(low, high, reach)
+    mass = sample.mass[row, None]
     flow = mass[:, :, None] * v[:, :, None] * v[:, None, :]
-    grains = deposited(sample.position, np.concatenate([mass, mass * v, flow.reshape(-1, 9)], axis=1), *grid)
+    grains = deposited(place, np.concatenate([mass, mass * v, flow.reshape(-1, 9)], axis=1), *grid)
     end = ends(sample)
-    branch = end.center - end.point
-    moment = (end.force[:, :, None] * branch[:, None, :]).reshape(-1, 9)
+    row, point, branch = branches(sample, end, low, high, reach)
+    moment = (end.force[row, :, None] * branch[:, None, :]).reshape(-1, 9)
     nodes, weights = np.polynomial.legendre.leggauss(3)
     contact = np.zeros((*shape, 9))
     for node, weight in zip(nodes, weights):  # of the interval from -1 to 1
-        contact += deposited(end.point + 0.5 * (1.0 + node) * branch, 0.5 * weight * moment, *grid)
+        contact += deposited(point + 0.5 * (1.0 + node) * branch, 0.5 * weight * moment, *grid)
     grains, contact = summed(sample, grains), summed(sample, contact)
     density, momentum = grains[..., 0], grains[..., 1:4]
     velocity = momentum / np.where(density > 0.0, density, 1.0)[..., None]
@@ -63,7 +66,7 @@ def fields(sample: Sample, region: Block, cells: Sequence[int], width: float, ke
 def deposited(point, value, low, spacing, shape, width, gauss):
     """Sums (nx, ny, nz, k) over points (m, 3) of their values (m, k) times the kernel at the middles of the cells."""
     out = np.zeros((shape[0], shape[1], shape[2], value.shape[1]))
-    reach = 3.0 * width if gauss else width
+    reach = CUT * width if gauss else width
     if gauss:  # erf(3 / sqrt 2) - sqrt(2 / pi) 3 exp(-9 / 2) of the Gaussian is within the cut
         scale = 1.0 / (0.9707091134651118 * (2.0 * np.pi) ** 1.5 * width**3)
     else:

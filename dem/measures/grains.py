@@ -8,6 +8,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
+from dem.measures.images import images
 from dem.measures.sample import Sample, summed
 from dem.mesh import Mesh, Surface
 
@@ -31,6 +32,15 @@ def ends(sample: Sample) -> Ends:
     couple = 0.0 if sample.moment is None else sign * sample.moment[row]
     force = sign * sample.force[row]
     return Ends(sample.bodies[row, side], sample.center[row, side], sample.point[row], force, row, couple)
+
+
+def branches(sample: Sample, end: Ends, low: Floats, high: Floats, reach: float = 0.0) -> tuple[Ints, Floats, Floats]:
+    """Rows (m,) of the ends of contacts and of their images, their points (m, 3) and the ways from there to the centres
+    (m, 3); of all that may come within `reach` of the box from `low` to `high` (3,) [m]."""
+    branch = end.center - end.point
+    longest = float(np.abs(branch).max(initial=0.0))
+    row, step = images(end.point, sample.lattice, low, high, reach + longest)
+    return row, end.point[row] + step @ sample.lattice, branch[row]
 
 
 def bearing(sample: Sample) -> Bools:
@@ -68,12 +78,16 @@ def triangle_forces(sample: Sample, body: int, mesh: Mesh, position: Floats, tur
     """Forces (triangles, 3) of grains on the triangles of a mesh, in the world frame [N].
 
     The mesh is all of the large body of this number (`Sample.bodies`) at `position` (3,) [m] and orientation `turn`
-    (4,). A contact's force is that of the triangle nearest to its point: searches keep no triangles."""
+    (4,). A contact's force is that of the triangle nearest to its point, or to an image of it: searches keep no
+    triangles."""
     first, second = (sample.bodies[:, side] == body for side in (0, 1))
     force = sample.force * (second.astype(float) - first)[:, None]
     rows = first | second
     back, own = quaternion.conjugate(turn), np.array(mesh.quaternion)
-    point = quaternion.rotate(back, sample.point[rows] - position) - np.array(mesh.center)
+    periods = [np.arange(-1.0, 2.0) if way.any() else np.zeros(1) for way in sample.lattice]  # a mesh is no longer
+    steps = np.stack(np.meshgrid(*periods, indexing="ij"), axis=-1).reshape(-1, 3)
+    point = sample.point[rows, None] + steps @ sample.lattice
+    point = quaternion.rotate(back, point - position) - np.array(mesh.center)
     point = quaternion.rotate(quaternion.conjugate(own), point) - mesh.surface.middle
     out = np.zeros((len(mesh.surface.triangle), 3))
     np.add.at(out, nearest(mesh.surface, point), force[rows])
@@ -81,16 +95,18 @@ def triangle_forces(sample: Sample, body: int, mesh: Mesh, position: Floats, tur
 
 
 def nearest(surface: Surface, point: Floats) -> Ints:
-    """The triangle (m,) that is nearest to each point (m, 3) in the frame of the surface, the first of equals."""
-    out, left = np.zeros(len(point), np.int64), np.arange(len(point))
+    """The triangle (m,) that is nearest to one of the k images of each point (m, k, 3) in the frame of the surface, the
+    first of equals."""
+    count = point.shape[1]
+    out, left, point = np.zeros(len(point), np.int64), np.arange(point[..., 0].size), point.reshape(-1, 3)
     reach = 1e-3 * float(surface.half.max())
     while len(left):
         row, triangle = surface.near(point[left], np.full(len(left), reach))
         away = surface.closest(point[left[row]], triangle).distance
         close = away <= reach  # nearer triangles than these are all among them
-        row, triangle, away = row[close], triangle[close], away[close]
+        row, triangle, away = left[row[close]] // count, triangle[close], away[close]
         order = np.lexsort((triangle, away, row))
         found, first = np.unique(row[order], return_index=True)
-        out[left[found]] = triangle[order[first]]
-        left, reach = np.delete(left, found), 2.0 * reach
+        out[found] = triangle[order[first]]
+        left, reach = left[~np.isin(left // count, found)], 2.0 * reach
     return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,11 +23,19 @@ class Profile(NamedTuple):
 
 
 def profile(sample: Sample, axis: ArrayLike, edges: ArrayLike) -> Profile:
-    """What is where along a direction `axis` (3,), in bins between the ascending `edges` (bins + 1,) [m]."""
-    edge = np.asarray(edges, float)
-    place = np.searchsorted(edge, sample.position @ np.asarray(axis, float) / np.linalg.norm(axis), "right") - 1
+    """What is where along a direction `axis` (3,), in bins between the ascending `edges` (bins + 1,) [m].
+
+    Along an axis with a period the edges may go on beyond the cell, with images of its grains; along other directions
+    each grain counts once."""
+    edge, along = np.asarray(edges, float), np.asarray(axis, float) / np.linalg.norm(axis)
+    own = np.abs(along) > 1.0 - 1e-12
+    ends = np.where(own[:, None], np.sort(np.sum(along * own) * edge[[0, -1]]), [-np.inf, np.inf])
+    repeated = replace(sample, lattice=sample.lattice * own[:, None])
+    row, position, velocity = repeated.grains_in(ends[:, 0], ends[:, 1])
+    place = np.searchsorted(edge, position @ along, "right") - 1
     rows = (place >= 0) & (place < len(edge) - 1)
-    columns = np.column_stack([np.ones(len(place)), sample.mass, sample.mass[:, None] * sample.velocity[:, :3]])
+    mass = sample.mass[row]
+    columns = np.column_stack([np.ones(len(place)), mass, mass[:, None] * velocity])
     table = np.zeros((len(edge) - 1, 5))
     np.add.at(table, place[rows], columns[rows])
     table = summed(sample, table)
@@ -53,9 +62,10 @@ def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> 
     With p the fraction of them among all, and s^2 the variance of the fractions in the cells, each with the weight of
     its grains: Lacey's index is (p (1 - p) - s^2) / (p (1 - p) - p (1 - p) / m) for cells of m grains on average that
     are not empty. NaN if there is one kind alone, or one grain per cell."""
-    shape, low = np.array(cells, np.int64), np.array(region.low, float)
-    rows = region.contains(sample.position)
-    place = ((sample.position[rows] - low) / ((np.array(region.high) - low) / shape)).astype(np.int64)
+    shape, (low, high) = np.array(cells, np.int64), region.bounds
+    rows, position, _ = sample.grains_in(low, high)
+    inside = region.contains(position)
+    rows, place = rows[inside], ((position[inside] - low) / ((high - low) / shape)).astype(np.int64)
     cell = np.ravel_multi_index(tuple(np.minimum(place, shape - 1).T), tuple(shape))
     size = int(shape.prod())
     found = np.stack([np.bincount(cell, minlength=size), np.bincount(cell, mask[rows], size)])

@@ -27,6 +27,11 @@ class Block:
         """[m^3]"""
         return float(np.prod(np.subtract(self.high, self.low)))
 
+    @property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """The corners (3,) of the least box along the axes around it [m]."""
+        return np.array(self.low, float), np.array(self.high, float)
+
     def contains(self, point: Floats) -> Bools:
         """Mask of points (n, 3) [m]."""
         inside: Bools = ((point >= self.low) & (point < self.high)).all(axis=1)
@@ -63,6 +68,14 @@ class Cylinder:
     def volume(self) -> float:
         """[m^3]"""
         return float(np.pi * self.radius**2 * self.length)
+
+    @property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """The corners (3,) of the least box along the axes around it [m]."""
+        ends = np.array([self.start, self.end], float)
+        across = 1.0 - ((ends[1] - ends[0]) / self.length) ** 2
+        reach = self.radius * np.sqrt(np.maximum(across, 0.0))
+        return ends.min(axis=0) - reach, ends.max(axis=0) + reach
 
     def _split(self, vector: Floats) -> tuple[Floats, Floats]:
         """The parts of vectors (n, 3) along (n,) and across (n, 3) the axis."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import CLUMP
+from dem.measures.images import images
 from dem.shapes import solid
 
 
@@ -34,12 +35,21 @@ class Sample:
     gap: Floats  #: (nc,) [m]
     force: Floats  #: (nc, 3) on the second, mean over the step [N]
     moment: Floats | None = None  #: (nc, 3) on the second, of contacts that resist rolling or spinning [N m]
+    #: (3, 3) the ways to the next images along each axis [m], and their velocities [m/s]; 0: no period
+    lattice: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+    drift: Floats = field(default_factory=lambda: np.zeros((3, 3)))
 
     def of(self, material: str) -> Bools:
         """Mask (n,) of the grains of a material; ValueError if there is none of that name."""
         if material not in self.materials:
             raise ValueError(f"material {material!r}: allowed is one of {', '.join(self.materials)}")
         return self.material == self.materials.index(material)
+
+    def grains_in(self, low: Floats, high: Floats, reach: float = 0.0) -> tuple[Ints, Floats, Floats]:
+        """Rows (m,), positions (m, 3) and linear velocities (m, 3) of this rank's grains and their images with centres
+        in the box from `low` to `high` (3,) or within `reach` of it [m]."""
+        row, step = images(self.position, self.lattice, low, high, reach)
+        return row, self.position[row] + step @ self.lattice, self.velocity[row, :3] + step @ self.drift
 
     @property
     def volume(self) -> Floats:

@@ -8,7 +8,8 @@ from dem.arrays import Bools, Floats
 from dem.bodies import SPHERE
 from dem.checks import positive
 from dem.compiled import loop
-from dem.measures.grains import bearing, ends
+from dem.measures.grains import bearing, branches, ends
+from dem.measures.images import images
 from dem.measures.region import Block, Cylinder, Region
 from dem.measures.sample import Sample, summed
 
@@ -19,17 +20,23 @@ def stress(sample: Sample, region: Region | Bools, volume: float | None = None) 
     leave nothing out. ValueError for a mask without volume."""
     end = ends(sample)
     if isinstance(region, (Block, Cylinder)):
-        part, volume = region.part(end.point, end.center), region.volume
+        row, point, branch = branches(sample, end, *region.bounds)
+        part, force, volume = region.part(point, point + branch), end.force[row], region.volume
     else:
-        part, volume = _everywhere(sample, region)[end.grain], _volume(volume)
-    return summed(sample, np.einsum("e,ea,eb->ab", part, end.force, end.center - end.point)) / volume
+        part, force, branch = _everywhere(sample, region)[end.grain], end.force, end.center - end.point
+        volume = _volume(volume)
+    return summed(sample, np.einsum("e,ea,eb->ab", part, force, branch)) / volume
 
 
 def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None = None) -> Floats:
     """Kinetic part (3, 3) of the stress: the sum of m v' v' over the volume, of the grains with their centres in a
     region, or of those of a mask; v' is the velocity beyond the mean one of these [Pa]."""
-    rows, volume = _rows(sample, region, volume)
-    mass, velocity = sample.mass[rows], sample.velocity[rows, :3]
+    if isinstance(region, (Block, Cylinder)):
+        row, place, velocity = sample.grains_in(*region.bounds)
+        inside, volume = region.contains(place), region.volume
+        mass, velocity = sample.mass[row[inside]], velocity[inside]
+    else:
+        mass, velocity, volume = sample.mass[region], sample.velocity[region, :3], _volume(volume)
     total = summed(sample, np.append(mass @ velocity, mass.sum()))
     beyond = velocity - total[:3] / (total[3] or 1.0)
     return summed(sample, (beyond.T * mass) @ beyond) / volume
@@ -38,7 +45,10 @@ def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None 
 def fabric(sample: Sample, region: Region) -> Floats:
     """Fabric tensor (3, 3): the mean of n n over the contacts that bear force and have their points in the region; its
     trace is 1, and 0 if there are no such contacts."""
-    normal = sample.normal[bearing(sample) & region.contains(sample.point)]
+    bears = np.flatnonzero(bearing(sample))
+    row, step = images(sample.point[bears], sample.lattice, *region.bounds)
+    inside = region.contains(sample.point[bears[row]] + step @ sample.lattice)
+    normal = sample.normal[bears[row[inside]]]
     total = summed(sample, np.append((normal.T @ normal).ravel(), len(normal)))
     return total[:9].reshape(3, 3) / (total[9] or 1.0)
 
@@ -47,11 +57,11 @@ def solid_fraction(sample: Sample, region: Region) -> float:
     """Volume of the grains in a region over its volume. Spheres that the faces of a Block cut count with the part
     inside, to 1e-3 of a sphere where several faces cut it and exactly where one does; other grains, and all in a
     Cylinder, count whole if their centre is inside."""
-    volume = sample.volume * region.contains(sample.position)
+    row, place, _ = sample.grains_in(*region.bounds, float(sample.size[sample.shape == SPHERE, 0].max(initial=0.0)))
+    volume = sample.volume[row] * region.contains(place)
     if isinstance(region, Block):
-        low, high = np.array(region.low, float), np.array(region.high, float)
-        balls = np.flatnonzero(sample.shape == SPHERE)
-        volume[balls] = cut_balls(sample.position[balls], sample.size[balls, 0].copy(), low, high)
+        balls = np.flatnonzero(sample.shape[row] == SPHERE)
+        volume[balls] = cut_balls(place[balls], sample.size[row[balls], 0], *region.bounds)
     return float(summed(sample, volume.sum())) / region.volume
 
 
@@ -101,9 +111,3 @@ def _volume(volume: float | None) -> float:
     if volume is None:
         raise ValueError("volume: a mask of grains needs the volume over which its stress is a mean")
     return float(positive("volume", volume))
-
-
-def _rows(sample: Sample, region: Region | Bools, volume: float | None) -> tuple[Bools, float]:
-    if isinstance(region, (Block, Cylinder)):
-        return region.contains(sample.position), region.volume
-    return region, _volume(volume)

@@ -64,14 +64,11 @@ class Incline(Experiment):
         """Mean speed along the incline and height of the spheres, and the solid fraction of the middle of the bed."""
         grains, count = step.world.grains, float(step.world.slabs[-1])
         height = step.total(grains.position[:, 2]) / count
-        x, y, r = *self.cell, self.radius
-        # wider than the cell by what grains reach over its sides: what leaves at one side comes in at the other
-        middle = Block((-r, -r, 0.5 * height), (x + r, y + r, 1.5 * height))
-        once = (x + 2.0 * r) * (y + 2.0 * r) / (x * y)
+        middle = Block((0.0, 0.0, 0.5 * height), (*self.cell, 1.5 * height))
         return {
             "speed [m/s]": step.total(grains.velocity[:, 0]) / count,
             "height [m]": height,
-            "solid_fraction": once * solid_fraction(step.sample, middle),
+            "solid_fraction": solid_fraction(step.sample, middle),
         }
 
     def analyse(self, records: Mapping[str, Floats]) -> dict[str, float | Floats]:

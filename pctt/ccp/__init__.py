@@ -68,8 +68,7 @@ def solve(
     Coulomb's law is found by the method itself if it can (`Solver.has_law`), else by a sequence of cone problems
     (`pctt.ccp.coulomb`).
 
-    A `RollingProblem`, whose impulses are (2 nc, 3), is for `conic`, `apgd` and `auto`. A problem of bodies with joints
-    or in a cell that deforms is for `apgd` and `auto`, and no other one follows.
+    A `RollingProblem`, whose impulses are (2 nc, 3), is for `conic`, `apgd` and `auto`.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
@@ -80,8 +79,7 @@ def solve(
     if law not in LAWS:
         raise ValueError(f"the law {law!r}: allowed are {', '.join(LAWS)}")
     rolls = isinstance(problem, RollingProblem)
-    coupled = problem.contact_map is not None and not problem.contact_map.has_rows
-    if why := why_refused(type, rolls, "joints, or a cell that deforms" if coupled else ""):
+    if why := why_refused(type, rolls):
         raise ValueError(f"the solver {type!r}: the problem has {why}")
     if rolls and newton is not None and newton.form != "body":
         raise ValueError(f"the Newton form {newton.form!r}: with rolling or spinning resistance allowed is body")
@@ -91,8 +89,9 @@ def solve(
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
     result = asked = _by(type, problem, _start(problem, guess), limits, options, newton, law)
     other = "conic" if asked.solver == "apgd" else "apgd"
-    hopeless = asked.final or (asked.status is Status.BREAKDOWN and other == "conic")  # products are no numbers
-    if limits.fallback and not hopeless and not coupled:
+    no_numbers = asked.status is Status.BREAKDOWN and other == "conic"  # products are none
+    hopeless = asked.final or asked.exhausted or no_numbers
+    if limits.fallback and not hopeless:
         second = _by(other, problem, asked.impulse, dataclasses.replace(limits, max_it=-1), None, newton, law)
         better = second.final or second.residual < asked.residual
         result = second.after(asked) if better else dataclasses.replace(asked).after(second)

@@ -6,28 +6,37 @@ root of the number of contacts, within a quarter of what was measured on settled
 one that is easy costs nothing more.
 
 For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
-So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path. Problems
-of few contacts are the exception: there it goes on to the end. It also takes these to an aim beyond the limits: it
-needs a few more steps for that, where APGD may need hundreds.
+So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path.
 
-With joints, which the sparse systems of the conic method do not have, it is APGD alone.
+Small problems are the exception: there it goes on to the end, and to an aim beyond the limits. Where friction is
+large, from 2 on, both may fail: APGD circles about the law, and the path of the conic method ends at a wall of its
+cones. So plain projected steps, which do not circle, and the conic method with shorter steps take turns, and at last
+there are cone problems for given De Saxce terms (`pctt.ccp.coulomb`). Where the relaxation has no solution, nothing
+says that Coulomb's law has one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from types import ModuleType
-from typing import Any
+from functools import partial
 
 import numpy as np
 
+from pctt.ccp import gathered
 from pctt.ccp.cone import Array
+from pctt.ccp.coulomb import Coulomb, fixed_point
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
 from pctt.ccp.newton import Newton
+from pctt.ccp.newton.linear import Settings
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import Limits, Result
+from pctt.ccp.result import Limits, Result, Status
+from pctt.ccp.unbounded import why_unbounded
 from pctt.options import number
+
+PLAIN = apgd.APGD(damping=1.0, near=1.0)  # without momentum
+SHORT = conic.Conic(start=1.0, boundary_with_law=0.5)
+TERMS = Coulomb(max_it=60, depth=2)
 
 
 @dataclass(frozen=True)
@@ -39,6 +48,8 @@ class Auto:
     law: float = number(5.0, "factor on it for Coulomb's law: more systems, and unsymmetric; docs/notebook_ccp.md")
     start: float = number(3e4, "complementarity of the conic method's start, at most, by APGD's residual")
     basin: float = number(3e-4, "Coulomb residual at which the conic method's path is near enough for APGD")
+    turns: int = number(4, "of plain steps and the conic method, where it fails in a small problem of Coulomb's law")
+    plain: int = number(100, "plain steps in each of them")
 
     def iterations(self, contacts: int, tol: float, coulomb: bool, few: bool = False) -> int:
         """Those of APGD. Small problems have fixed costs; where they are ``few`` those of both methods are calls."""
@@ -51,32 +62,84 @@ def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Auto, newton: Newton, coulomb: bool = False
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
-    tried: list[Result] = []
+    tried = Attempts(problem, limits, newton, coulomb)
+    few, small = newton.has_few(problem), problem.size <= Settings.few
+    begun = min(limits.max_it, problem.comm.bcast(options.iterations(problem.size, limits.tol, coulomb, few)))
+    first = tried.apgd(guess, begun)
+    if first.converged and first.residual > limits.aimed:
+        tried.beyond(guess, few)
+    elif not first.final and begun < limits.max_it:
+        if not coulomb:
+            settings = conic.Conic()
+            tried.conic(first.impulse, replace(settings, start=min(settings.start, options.start * first.residual)))
+        else:
+            second = tried.conic(guess, conic.Conic(), 0.0 if small else max(limits.tol, options.basin))
+            if not small or second.status is Status.GIVEN_UP:
+                tried.apgd(second.impulse if second.iterations else first.impulse, limits.max_it)
+            elif not second.final:
+                tried.in_turns(options)
+    return tried.result()
 
-    def attempt(method: ModuleType, guess: Array, limits: Limits, *more: Any) -> Result:
-        result: Result = method.solve(problem, guess, limits, *more, coulomb=coulomb)
-        result.solver = "conic" if method is conic else "apgd"
-        result.newton_its = result.iterations if method is conic else 0
-        tried.append(result)
+
+class Attempts:
+    """What methods have made of a problem, one after another."""
+
+    def __init__(self, problem: ConeProblem, limits: Limits, newton: Newton, coulomb: bool):
+        self.problem, self.limits, self.newton, self.coulomb = problem, limits, newton, coulomb
+        self.all: list[Result] = []
+        self.most = min(60, limits.max_it)  # iterations of the conic method
+
+    def keep(self, result: Result, solver: str) -> Result:
+        result.solver, result.newton_its = solver, result.iterations if solver == "conic" else 0
+        self.all.append(result)
         return result
 
-    alone = problem.contact_map is not None and not problem.contact_map.has_rows  # apgd takes it alone
-    few = not alone and newton.has_few(problem)
-    most = limits.max_it if alone else options.iterations(problem.size, limits.tol, coulomb, few)
-    begun = min(limits.max_it, problem.comm.bcast(most))
-    last = first = attempt(apgd, guess, replace(limits, max_it=begun, spare=0 if few else limits.spare), apgd.APGD())
-    if few and first.converged and first.residual > limits.aimed:
-        last = min(first, attempt(conic, guess, limits, conic.Conic(), newton), key=lambda result: result.residual)
-        tried.sort(key=lambda result: result is last)
-    elif not first.final and begun < limits.max_it:
-        inner, settings, begin = replace(limits, max_it=min(60, limits.max_it)), conic.Conic(), guess
-        if not coulomb:
-            settings = conic.Conic(start=min(settings.start, options.start * first.residual))
-            begin = first.impulse
-        elif not few:
-            inner = replace(inner, tol=max(limits.tol, options.basin), closing_work=np.inf, closing_speed=np.inf)
-        last = second = attempt(conic, begin, inner, settings, newton)
-        if coulomb and not (few and second.final):
-            last = attempt(apgd, second.impulse if second.iterations else first.impulse, limits, apgd.APGD())
-        last.reason = "; ".join(f"{result.solver}: {result.reason}" for result in tried)
-    return last.after(*tried[:-1])
+    def apgd(self, guess: Array, most: int, options: apgd.APGD = apgd.APGD(), spare: int = 0) -> Result:
+        limits = replace(self.limits, max_it=min(most, self.limits.max_it), spare=spare)
+        return self.keep(apgd.solve(self.problem, guess, limits, options, coulomb=self.coulomb), "apgd")
+
+    def conic(self, guess: Array, options: conic.Conic, basin: float = 0.0) -> Result:
+        """To the limits, or to the ``basin`` of the residual alone."""
+        limits = replace(self.limits, max_it=self.most)
+        if basin:
+            limits = replace(limits, tol=basin, closing_work=np.inf, closing_speed=np.inf)
+        given = self.problem, guess, limits, options, self.newton
+        return self.keep(conic.solve(*given, coulomb=self.coulomb), "conic")
+
+    def beyond(self, guess: Array, few: bool) -> None:
+        """To the aim of limits that APGD has met: few contacts by the conic method, many by APGD."""
+        given = guess, replace(self.limits, max_it=self.most), conic.Conic(), self.newton
+        if few or gathered.takes(self.problem, self.newton):
+            method = conic if few else gathered
+            self.keep(method.solve(self.problem, *given, coulomb=self.coulomb), "conic")
+        if self.best.residual > self.limits.aimed and self.limits.spare:
+            self.apgd(self.best.impulse, self.limits.max_it, spare=self.limits.spare)
+
+    @property
+    def best(self) -> Result:
+        return min(self.all, key=lambda result: result.residual)
+
+    def in_turns(self, options: Auto) -> None:
+        """Plain steps and shorter ones of the conic method; then the relaxation, and cone problems that begin there."""
+        for _ in range(options.turns):
+            if self.apgd(self.best.impulse, options.plain, PLAIN).final or self.conic(self.best.impulse, SHORT).final:
+                return
+        problem = self.problem
+        by_conic = partial(conic.solve, problem, options=conic.Conic(), newton=self.newton)
+        limits = replace(self.limits, max_it=self.most)
+        relaxed = by_conic(guess=np.zeros_like(problem.r), limits=limits)
+        if why := why_unbounded(problem, relaxed.impulse):
+            self.keep(replace(relaxed, status=Status.UNBOUNDED, reason=f"of the relaxation, {why}"), "conic")
+            return
+        terms = fixed_point(lambda g, limits: by_conic(guess=g, limits=limits), problem, relaxed.impulse, limits, TERMS)
+        self.keep(terms.after(relaxed), "conic").exhausted = True
+
+    def result(self) -> Result:
+        """The last one, or the best where the first met the limits, or nothing is left to try; with what all have
+        cost."""
+        last = self.all[-1]
+        found = self.best if self.all[0].converged or (last.exhausted and not last.final) else last
+        found.exhausted = last.exhausted
+        if len(self.all) > 1:
+            found.reason = "; ".join(f"{result.solver}: {result.reason}" for result in self.all)
+        return found.after(*(result for result in self.all if result is not found))

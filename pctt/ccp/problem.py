@@ -199,6 +199,22 @@ class ConeProblem:
         normal = self.compliance[: self.cones.count, 0]
         return self.yields and self.min(normal.min(initial=np.inf)) > 0.0
 
+    def by_rows(self) -> ConeProblem:
+        """The same problem with the rows of its map as they are, if more than contacts couples its bodies; it shares
+        all arrays, and has the same residuals. Collective."""
+        if self.contact_map is None or not self.contact_map.couples:
+            return self
+        other = copy.copy(self)
+        for name in ("_rigid_blocks", "diagonal", "diagonal_blocks", "_split", "N"):  # those of its map are estimates
+            other.__dict__.pop(name, None)
+        other.contact_map = other.operator = self._block_map
+        return other
+
+    @cached_property
+    def _block_map(self) -> BlockMap:
+        assert self.contact_map is not None
+        return BlockMap(self.comm, self.contact_map.block_rows)
+
     def by_matrix(self, N: GivenMatrix) -> ConeProblem:
         """The same problem given by its N without compliance; it shares all arrays."""
         other = copy.copy(self)

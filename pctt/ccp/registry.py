@@ -23,8 +23,8 @@ class Solver:
 
     ``needs`` is PRODUCT, MATRIX, NEWTON or EITHER; ``iterations`` the default limit (``-ccp_max_it``). A method that
     ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself; one that ``has_rolling``
-    takes a `pctt.ccp.rolling.RollingProblem`, one that ``has_coupled`` a problem of bodies with joints or in a cell
-    that deforms, and one that ``has_multipliers`` can have them as unknowns of its Newton systems (the form `kkt`).
+    takes a `pctt.ccp.rolling.RollingProblem`, and one that ``has_multipliers`` can have them as unknowns of its Newton
+    systems (the form `kkt`).
     """
 
     name: str
@@ -36,7 +36,6 @@ class Solver:
     source: str
     has_law: bool = False
     has_rolling: bool = False
-    has_coupled: bool = False
     has_multipliers: bool = False
 
     @property
@@ -59,10 +58,10 @@ SOLVERS = {
                "Nesterov, Todd 1997; Acary et al. 2023", has_law=True, has_rolling=True),
         Solver("auto", auto.solve, auto.Auto, EITHER, 20_000,
                "`apgd` for as many iterations as half of `conic` costs, then `conic`", "`pctt/ccp/auto.py`",
-               has_law=True, has_rolling=True, has_coupled=True),
+               has_law=True, has_rolling=True),
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
                "accelerated projected gradient descent with restart", "Mazhar et al. 2015", has_law=True,
-               has_rolling=True, has_coupled=True),
+               has_rolling=True),
         Solver("barzilai_borwein", projected_steps.adaptive, projected_steps.BarzilaiBorwein, PRODUCT, 20_000,
                "projected Barzilai-Borwein steps with an adaptive nonmonotone line search", "Dai, Fletcher 2005"),
         Solver("spectral", projected_steps.spectral, projected_steps.BarzilaiBorwein, PRODUCT, 20_000,
@@ -82,13 +81,10 @@ SOLVERS = {
 }  # fmt: skip
 
 
-def why_refused(type: str, rolls: bool, coupled: str) -> str:
-    """In words, why a method cannot take problems with resistance to rolling or spinning, or with what is said to
-    couple the bodies, and which methods can; "" if it can."""
-    with_coupled = [name for name, method in SOLVERS.items() if method.has_coupled]
+def why_refused(type: str, rolls: bool) -> str:
+    """In words, why a method cannot take problems with resistance to rolling or spinning, and which methods can; "" if
+    it can."""
     with_rolling = [name for name, method in SOLVERS.items() if method.has_rolling]
-    if coupled and type not in with_coupled:
-        return f"{coupled}; allowed are {', '.join(with_coupled)}"
     if rolls and type not in with_rolling:
         return f"rolling or spinning resistance; allowed are {', '.join(with_rolling)}"
     return ""

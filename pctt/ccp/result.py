@@ -122,6 +122,7 @@ class Result:
     momentum : (6m,) G' g, or g where the problem is given by N; set by `pctt.ccp.solve`
     beyond : iterations among them after the limits were met, towards the aim beyond these
     asked : what the asked method made of it, where another one had to follow; else None
+    exhausted : whether it has tried the other methods, too
     """
 
     impulse: Array
@@ -140,6 +141,7 @@ class Result:
     momentum: Array = field(default_factory=lambda: np.zeros(0))
     beyond: int = 0
     asked: Result | None = None
+    exhausted: bool = False
 
     @property
     def converged(self) -> bool:

@@ -25,7 +25,7 @@ from dem import bodies
 from dem.exchange import exchange
 from dem.experiment import Experiment
 from dem.motion import Dynamic
-from dem.period import velocity_in_cell, wrapped
+from dem.period import lattice, velocity_in_cell, wrapped
 from dem.polyhedra import triangles
 from dem.scene import least_half
 from dem.shapes import described
@@ -191,19 +191,21 @@ class Writer:
             return
         if self._recorded == self._start:
             self.place.make("frames")
-            rows = _by_id(world, TABLE[1:])
-            large = np.bytes_(json.dumps(described_bodies(world)))
-            shared = {"materials": texts(world.materials), "large": large}
-            for name, shapes in described_forms(world).items():
-                if shapes:
-                    shared[name] = np.bytes_(json.dumps(shapes))
-            write_rows(frames / "bodies.h5", self.comm, rows, shared, {})
+            table = frames / "bodies.h5"
+            if not on_first(self.comm, table, lambda: self.place.goes_on and table.exists()):  # of the first frame
+                rows = _by_id(world, TABLE[1:])
+                large = np.bytes_(json.dumps(described_bodies(world)))
+                shared = {"materials": texts(world.materials), "large": large}
+                for name, shapes in described_forms(world).items():
+                    if shapes:
+                        shared[name] = np.bytes_(json.dumps(shapes))
+                write_rows(table, self.comm, rows, shared, {})
         near = contacts.near.bodies
         rows = {
             **_by_id(world, (*PLACES, *(TABLE if world.tallies else ()))),
             "contact/key": contacts.key,
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
-            "contact/point": wrapped(contacts.point, world.period, world.shear),
+            "contact/point": step.point,
             "contact/frame": step.system.frame,
             "contact/moved": np.zeros_like(contacts.point) if contacts.moved is None else contacts.moved,
             "contact/gap": contacts.gap,
@@ -211,7 +213,11 @@ class Writer:
         }
         if (moments := step.moments) is not None:
             rows["contact/moment"] = moments
-        about = {"/": {"step": world.step, "time": world.time}, "record": row, "contact": {"dt": step.system.dt}}
+        top: dict[str, Any] = {"step": world.step, "time": world.time}
+        if world.period is not None:
+            top["lattice"], top["drift"] = lattice(world.period, world.shear)
+            top["rate"] = np.zeros(3) if world.servo is None else world.servo.rate
+        about = {"/": top, "record": row, "contact": {"dt": step.system.dt}}
         write_rows(frames / f"{world.step:06d}.h5", self.comm, rows, {}, about)
         self._recorded = world.step
 

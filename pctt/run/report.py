@@ -30,8 +30,10 @@ NOT_THE_LAW = (
     "relaxation, or leave out -ksp_type, -pc_type and -ccp_newton contact"
 )
 
-#: What helps against jumps of energy; a smaller tolerance does not.
-JUMP_ADVICE = "What helps: a smaller -dt, a -stiffness, or a tool of bounded force or torque (docs/mechanics.md)"
+def jump_advice(program: bool) -> str:
+    """What helps against jumps of energy; a smaller tolerance does not."""
+    dt, stiffness = (option_name(field, program) for field in ("dt", "stiffness"))
+    return f"What helps: a smaller {dt}, a {stiffness}, or a tool of bounded force or torque (docs/mechanics.md)"
 
 
 def residual(line: Mapping[str, Any]) -> float:
@@ -48,13 +50,30 @@ def columns(compared: bool) -> str:
     )
 
 
-def stiffness_line(stiffness: np.ndarray, overlap: float) -> str:
-    """The stiffnesses [N/m] of contacts, and the part of a radius that bodies may overlap by."""
+def option_name(field: str, program: bool) -> str:
+    """The name of an option of `Settings` as the program has it, or Python."""
+    return f"-{'ccp_tol' if field == 'tol' else field}" if program else f"{field}="
+
+
+def mending(field: str, program: bool) -> str:
+    """How an option of `Settings` has to change that overlaps are smaller."""
+    return f"a {'larger' if field == 'stiffness' else 'smaller'} {option_name(field, program)}"
+
+
+def dt_line(dt: float, reason: str) -> str:
+    """What the time step [s] was chosen for."""
+    return f"dt {dt:g} s, for {reason}; -dt takes another"
+
+
+def stiffness_line(stiffness: np.ndarray, overlap: float, steps: float) -> str:
+    """The stiffnesses [N/m] of contacts, and the parts of a half thickness that bodies may overlap by as springs, and
+    by the length of steps."""
     if np.isinf(stiffness).all():
         return "rigid contacts"
     least, most = (f"{value:.2g}" for value in (stiffness.min(), stiffness.max()))
     words = f"contacts of {least} N/m" if least == most else f"contacts of {least} to {most} N/m"
-    return f"{words}: weight and tools make overlaps of up to {100 * overlap:.2g} % of a radius"
+    by = f"weight, tools and falls make overlaps of up to {100 * overlap:.2g} % of a radius"
+    return f"{words}: {by}, steps of up to {100 * steps:.2g} %"
 
 
 def step_line(line: Mapping[str, Any]) -> str:
@@ -89,11 +108,13 @@ def _shortfall(line: Mapping[str, Any]) -> str:
     return f"NOT CONVERGED: {residuals}: {line['reason']}"
 
 
-def jump_words(line: Mapping[str, Any]) -> str:
-    """What is said at once of a step with a jump of energy."""
+def jump_words(line: Mapping[str, Any], program: bool) -> str:
+    """What is said at once of the first step with a jump of energy; the program has other names of options than
+    Python."""
     return (
         f"step {line['step']}: the kinetic energy rises by {line['energy_jump']:.3g} J to"
-        f" {line['kinetic_energy [J]']:.3g} J, tenfold or out of nothing. {JUMP_ADVICE}"
+        f" {line['kinetic_energy [J]']:.3g} J, tenfold or out of nothing. {jump_advice(program)}. Later "
+        "jumps are in the figure energy_jump of their steps"
     )
 
 
@@ -145,13 +166,14 @@ def remaining(spent: float, done: int, steps: int) -> str:
 
 def ending(
     steps: Sequence[Mapping[str, Any]], tol: float, closing_work: float, figures: Mapping[str, float],
-    worst: Mapping[str, float],
+    worst: Mapping[str, float], cause: str,
 ) -> str:  # fmt: skip
     """What steps have taken and shown: the phases, the law, jumps, forces, the numbers of the scene's analysis, and the
-    worst overlap of the run. ``tol`` and ``closing_work`` are those of the settings."""
+    worst overlap of the run. ``tol`` and ``closing_work`` are those of the settings, ``cause`` is that of
+    `OverlapWatch`."""
     outside = steps[-1]["record"].get("grains_outside")
     said = [phase_table(steps), law_line(steps, tol), jumps_line(steps), forces_line(steps, closing_work)]
-    said += [figure_table(figures), overlap_line(worst)]
+    said += [figure_table(figures), overlap_line(worst, cause)]
     said += [f"{outside:.0f} grains have left the domain of the scene"] if outside else []
     return "\n".join(filter(None, said))
 
@@ -213,7 +235,7 @@ def jumps_line(steps: Sequence[Mapping[str, Any]]) -> str:
         return ""
     worst = max(jumps, key=lambda line: line["energy_jump"])
     said = f"WARNING: {len(jumps)} jumps of energy, the largest of {worst['energy_jump']:.3g} J in step {worst['step']}"
-    return f"{said}; means are without these steps. {JUMP_ADVICE}"
+    return f"{said}; means are without these steps. {jump_advice(True)}"
 
 
 def forces_line(steps: Sequence[Mapping[str, Any]], limit: float) -> str:
@@ -228,13 +250,13 @@ def forces_line(steps: Sequence[Mapping[str, Any]], limit: float) -> str:
     return f"WARNING: {said}: forces on bodies may be far off; try {hint} (docs/accuracy.md)"
 
 
-def overlap_line(worst: Mapping[str, float]) -> str:
+def overlap_line(worst: Mapping[str, float], cause: str = "dt") -> str:
     """The worst overlap of a run, and what to do about one that is not small."""
     overlap, radius = worst["overlap [m]"], worst["smallest_radius [m]"]
     line = f"worst overlap {overlap:.2g} m, {overlap / radius:.1%} of the smallest radius, at step {worst['step']}"
     if overlap <= LARGE_OVERLAP * radius:
         return line
-    return f"WARNING: {line}; try a smaller -dt, then a smaller -ccp_tol"
+    return f"WARNING: {line}; try {mending(cause or 'dt', True)}"
 
 
 def figure_table(figures: Mapping[str, float]) -> str:

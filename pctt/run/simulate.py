@@ -42,7 +42,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
             raise OptionError(f"-dump_problem: {why}")
     compare = ccp.Comparison(comm, run.compared(), run.compare_every)
     with Simulation(
-        options.scene, options.settings, comm=comm, restart=run.restart, compare=compare, say=progress.say
+        options.scene, options.settings, comm=comm, restart=run.restart, compare=compare, say=progress.say, program=True
     ) as sim:
         if sim.restart:
             progress.say(f"from {sim.restart}: step {sim.steps}, time {sim.time:g} s")
@@ -61,7 +61,10 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     steps = options.run.steps_of(settings.dt)
     end = sim.steps + steps
     progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {settings.words}")
-    progress.say(report.stiffness_line(sim.world.pairs.stiffness, sim.expected_overlap))
+    if sim.dt_reason:
+        progress.say(report.dt_line(settings.dt, sim.dt_reason))
+    watch = sim.overlap_watch
+    progress.say(report.stiffness_line(sim.world.pairs.stiffness, watch.springs, watch.steps))
     if settings.tol > report.LOOSE:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE_BECAUSE}")
     solver = ccp.SOLVERS[settings.solver]
@@ -87,7 +90,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         if sim.comm.rank == 0:
             lines = [line for line in output.folder.lines() if line["step"] > end - steps]
             worst = output.folder.summary["worst_overlap"]
-            progress.say("\n" + report.ending(lines, settings.tol, settings.closing_work, figures, worst))
+            progress.say("\n" + report.ending(lines, settings.tol, settings.closing_work, figures, worst, watch.cause))
         if what := newton.linear.what():
             progress.say(f"Newton systems: {what}")
         if compare.names:

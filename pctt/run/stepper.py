@@ -19,7 +19,7 @@ from dem.partition import rebalance
 from dem.passage import come_and_go
 from dem.period import put_back
 from dem.step import advance, carried, find_overrun, find_turned
-from dem.system import ContactSystem
+from dem.system import ContactSystem, contact_frames
 from dem.together import SceneError
 from dem.world import World
 from pctt import ccp, log
@@ -60,6 +60,7 @@ class Stepper:
         # what joints hold and what drives give in the present step, once its contacts have shown it, and how often
         self._joints: Coupling | None = None
         self._spent: Ints | None = None
+        self._push: Array | None = None  # momenta that the contacts of the present step are expected to give
         self._shown = 0
         self._slabs: Ints | None = None  # those of the last step, or of a solution that is remembered within this one
         if settings.stiffness is not None:
@@ -98,7 +99,7 @@ class Stepper:
             raise
 
     def _step(self) -> dict[str, Any]:
-        self._corrections, self._shown, self._joints, self._spent = 0, 0, None, None
+        self._corrections, self._shown, self._joints, self._spent, self._push = 0, 0, None, None, None
         with log.phase("search"):
             come_and_go(self.world)
             put_back(self.world)
@@ -117,7 +118,9 @@ class Stepper:
             self.impulse, self.history = self.system.net(forces), result.history
             self.moment = None if self.system.resistance is None else moments
             self.system.take_flow(self.world, self.contacts)
-            advance(self.world, self.system.velocity_with(result.momentum), self.settings.dt)
+            velocity = self.system.velocity_with(result.momentum)
+            kept = self.system.kept(self.world, velocity) if self.system.middle is not None else None
+            advance(self.world, velocity, self.settings.dt, kept)
             kept = self.system.held_after(result.impulse)  # with which springs begin the next step
             self.memory.remember(self.system.key, kept, self.system.frame)
             self._slabs = self.world.slabs
@@ -171,11 +174,12 @@ class Stepper:
         self._release()
         given = self.settings.dt, self.settings.recovery_speed, self._joints, self._spent
         with log.phase("assembly"):
-            self.contacts, self.system = contacts, ContactSystem(self.world, contacts, *given)
-            place = self.system.key, self.system.frame
+            place = contacts.key, contact_frames(contacts.normal)
             last, _ = self.memory.recall(*place, self._slabs is not self.world.slabs)
+            self.contacts, self.system = contacts, ContactSystem(self.world, contacts, *given, last, self._push)
+            self._push = self.system.push
             guess = last if found is None else found.recall(*place, elsewhere=False)[0]
-            self.system.take_hold(last[: len(contacts), 1:])
+            self.system.take_hold(last[: len(contacts)])
             self._problem = cone_problem(self.system, self.world.comm)
         return self._problem, guess
 

@@ -146,7 +146,7 @@ def draw(cases: list[list[Row]]) -> None:
             groups["tolerances"] = [row for row in rows if row["settings"].startswith("1,tol")]
             for (label, chosen), style in zip(groups.items(), ("o-", "x", ".")):
                 off = [100 * (row["figure"] / limit - 1) for row in chosen]
-                bars = [100 * row["error"] / abs(limit) for row in chosen]
+                bars = [100 * np.nan_to_num(row["error"]) / abs(limit) for row in chosen]  # one start has no error
                 axes.errorbar([row["cpu"] for row in chosen], off, bars, fmt=style, capsize=2, label=label)
             for row in plain:
                 axes.annotate(f"{1e3 * row['dt']:.3g} ms", (row["cpu"], 100 * (row["figure"] / limit - 1)), (4, 4),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from shared import PYTHON, figure, markdown, record, say_machine
-from validation import benchmarks, closed_forms, laws, packings
+from validation import benchmarks, closed_forms, impacts, laws, packings, structures
 from validation.panels import PANELS
 from validation.rows import Row
 
@@ -87,6 +87,9 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
 #: What reads the runs of each check: rows of the table, and what the figure shows.
 CHECKS: dict[str, Callable[[], tuple[list[Row], dict[str, Any]]]] = {
     "closed_forms": lambda: (closed_forms.rows(), {}),
+    "impacts": lambda: (impacts.rows(), {}),
+    "tops": lambda: (structures.tops(), {}),
+    "structures": lambda: (structures.rows(), {}),
     "silo": lambda: laws.silo({D: [RUNS / f"silo_{D:g}_{seed}" for seed in SEEDS] for D in OUTLETS}),
     "drum": lambda: laws.drum(RUNS / "drum"),
     "heap": lambda: laws.heap({mu: [RUNS / f"heap_{mu:g}_{seed}" for seed in SEEDS] for mu in FRICTIONS}),

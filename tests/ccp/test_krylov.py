@@ -36,23 +36,24 @@ def overwrite(S, dense: np.ndarray) -> None:
 @pytest.mark.parametrize("pc", ["none", "jacobi", "pbjacobi", "ilu", "icc", "sor", "gamg", "hypre", "cholesky", "lu"])
 @pytest.mark.parametrize("method", ["bcgs", "cg", "gmres"])
 def test_the_true_residual_is_the_true_one(pc, method):
-    """||b - S x|| / ||b|| from S, x and b themselves, and small where the solve says that it converged. On several
-    ranks the factorisations of one rank work within each."""
+    """||b - S x|| / ||b|| from S, x and b themselves, and small where the solve says that it converged. It must where
+    the condition number is 9.3; where it is 8,300, rounding decides. On several ranks the factorisations of one rank
+    work within each."""
     comm = MPI.COMM_WORLD
-    dense, S, x, b = system(comm=comm)
     krylov = Krylov(comm, f"{pc}_{method}_", {"pc_type": pc, "ksp_type": method}, rtol=1e-7)
-    done = krylov.solve(S, b, x)
-    solution, rhs = (np.concatenate(comm.allgather(v.array)) for v in (x, b))
-    residual = np.linalg.norm(rhs - dense @ solution) / np.linalg.norm(rhs)
-    assert done.true_residual == pytest.approx(residual, rel=1e-3, abs=1e-12)
-    assert done.true_residual <= 2e-7 or not done.converged
-    assert done.true_residual > 5e-8 or done.converged  # a KSP measures in a norm of its own
-    if method == "bcgs" and pc != "none":
-        assert done.converged
-    assert min(done.setup_s, done.solve_s) > 0
-    assert comm.allgather((done.iterations, done.converged)) == [(done.iterations, done.converged)] * comm.size
-    within = comm.size > 1 and pc in ("ilu", "icc")
-    assert krylov.ksp.pc.getType() == ("bjacobi" if within else pc)
+    for shift in (1.0, 1000.0):
+        dense, S, x, b = system(shift, comm)
+        done = krylov.solve(S, b, x)
+        solution, rhs = (np.concatenate(comm.allgather(v.array)) for v in (x, b))
+        residual = np.linalg.norm(rhs - dense @ solution) / np.linalg.norm(rhs)
+        assert done.true_residual == pytest.approx(residual, rel=1e-3, abs=1e-12)
+        assert done.true_residual <= 2e-7 or not done.converged
+        assert done.converged or shift == 1.0, done
+        assert min(done.setup_s, done.solve_s) > 0
+        assert comm.allgather((done.iterations, done.converged)) == [(done.iterations, done.converged)] * comm.size
+        within = comm.size > 1 and pc in ("ilu", "icc")
+        assert krylov.ksp.pc.getType() == ("bjacobi" if within else pc)
+        krylov.forget()
 
 
 def test_defaults_and_the_users_options(database):
@@ -112,7 +113,7 @@ def test_options_count_as_used_once_a_system_is_solved_with_them(database):
 
 def test_eisenstat_works_on_scalar_rows():
     """On blocks of three PETSc 3.18 ends in a segmentation fault."""
-    dense, S, x, b = system(shift=100.0)
+    dense, S, x, b = system(shift=1000.0)
     assert Krylov(SELF, "e_", {"pc_type": "eisenstat"}, rtol=1e-7).solve(S, b, x).iterations > 1
     assert np.linalg.norm(dense @ x.array - b.array) <= 1e-5 * np.linalg.norm(b.array)
 
@@ -121,7 +122,7 @@ def test_eisenstat_works_on_scalar_rows():
 def test_a_breakdown_is_reported_and_forgotten(pc):
     """A matrix with a NaN, or a set-up that fails: nothing is raised, and the next matrix is solved as if nothing had
     been."""
-    dense, S, x, b = system()
+    dense, S, x, b = system(shift=1000.0)
     krylov = Krylov(SELF, "broken_", {"pc_type": pc}, rtol=1e-6)
     broken = dense.copy()
     broken[4, 4] = np.nan

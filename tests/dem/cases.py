@@ -74,7 +74,7 @@ def heap(
         )
         scene.add_body(
             "slab",
-            [Sphere(0.1, (x, y, 0)) for x in (0.2, 0.9) for y in (0.3, 0.8)],
+            [Sphere(0.1, (x, y, 0)) for x in (0.2, min(0.9, width - 0.11)) for y in (0.3, min(0.8, width - 0.11))],
             Dynamic(),
             density=500.0,
             position=(0, 0, 0.25 * side + 0.12),

@@ -213,3 +213,26 @@ def test_ids_materials_mass_and_inertia():
     table = scene.pairs(1.0).friction
     assert table[grains.material[0], large.material[0]] == table[large.material[0], grains.material[0]] == 0.7
     assert table[grains.material[2], large.material[0]] == 0.3
+
+
+def test_large_bodies_that_overlap_at_the_start_are_refused():
+    """By more than 1 % of a half thickness; not those of a joint, of prescribed motions, or that no force can part."""
+
+    def start(motion=Dynamic(), place=(0.0, 0.0, 0.06), other=(0.9, 0.0, 1.0), joint=False):
+        scene = Scene(0.3)
+        scene.add_body("floor", [Plane((0, 0, 1))])
+        given = {"density": 500.0} if isinstance(motion, Dynamic) else {}
+        scene.add_body("bar", [Box((0.5, 0.05, 0.05))], motion, position=place, **given)
+        scene.add_body("other", [Box((0.5, 0.05, 0.05))], Dynamic(), position=other, density=500.0)
+        if joint:
+            scene.add_joint("hinge", "bar", "other", anchor=(0.45, 0, 1.0), axis=(0, 1, 0))
+        new_world(scene, MPI.COMM_SELF)
+
+    start()
+    start(place=(0, 0, 0.0496))
+    start(place=(0, 0, 1.0), joint=True)
+    start(motion=Glide((1, 0, 0)), place=(0, 0, 0.02))
+    start(motion=Hinged((0, 0, 1)), place=(0, 0, 0.02))
+    for place, names in (((0, 0, 0.049), "'floor' and body 'bar'"), ((0, 0, 1.0), "'bar' and body 'other'")):
+        with pytest.raises(ValueError, match=f"overlapping start: body {names}"):
+            start(place=place)

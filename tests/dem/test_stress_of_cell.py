@@ -10,6 +10,7 @@ from dem.scene import Scene
 from dem.scenes import PlaneShear
 from dem.servo import CLOSING, KEPT, LEADING
 from dem.shapes import Plane
+from pctt.ccp.delassus import BlockMap
 
 PRESSURE = 1000.0
 OF_RUNS = {"dt": 0.001, "solver": "apgd", "tol": 1e-6}
@@ -155,6 +156,9 @@ def test_products_with_the_map_of_a_cell_are_those_of_a_matrix(turning):
     energy = comm.allreduce(G.energy_of_step(image, nothing, nothing, 0.0))
     assert energy == pytest.approx(comm.allreduce(np.vdot(g, expected)), rel=1e-9)
     check_part(G, g, count)
+    rows, v = BlockMap(comm, G.block_rows), random.normal(size=(G.columns, 6))
+    np.testing.assert_allclose(rows.velocities(v), G.velocities(v), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(rows.momenta(g), G.momenta(g), rtol=1e-9, atol=1e-9)
     blocks = free.contact_blocks()
     blocks[:count] += lever @ lever.transpose(0, 2, 1)
     np.testing.assert_allclose(G.contact_blocks(), blocks, rtol=1e-12)
@@ -270,8 +274,6 @@ def test_refused():
         walled.grains()
     with pytest.raises(ValueError, match="contacts that give way"):
         pctt.Simulation(scene(stiffness=np.inf), dt=0.01)
-    with pytest.raises(ValueError, match="a cell that deforms; allowed are"):
-        pctt.Simulation(scene(), dt=0.01, solver="conic")
     with pytest.raises(ValueError, match="periods of this scene are constant"):
         pctt.Simulation(scene(stress=None), dt=0.01).set_stress((None, None, 1e3))
 

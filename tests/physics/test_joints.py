@@ -11,6 +11,7 @@ from dem.motion import Dynamic, Glide
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from pctt import ccp
+from pctt.ccp.delassus import BlockMap
 from pctt.folder import Folder
 from pctt.options import OptionError
 from pctt.run.stepper import NoSolutionError
@@ -287,7 +288,7 @@ def test_friction_of_jointed_bodies_that_slide_is_coulombs():
     assert sim.velocities == pytest.approx(np.zeros((2, 6)), abs=1e-5)
 
 
-@pytest.mark.parametrize("solver", ["apgd", "auto"])
+@pytest.mark.parametrize("solver", ccp.SOLVERS)
 def test_contacts_and_joints_are_solved_together(solver):
     """A lever that is hinged at one end lies with the other on the floor, which bears half of its weight."""
     scene = Scene(friction=0.0)
@@ -297,7 +298,8 @@ def test_contacts_and_joints_are_solved_together(solver):
     scene.add_joint("pin", None, "bar", anchor=(0, 0, 0.2), axis=(0, 1, 0))
     scene.add_joint("foot", "bar", ball, kind="fixed", anchor=(0.9, 0, 0.2))
     sim = simulation(scene, solver=solver)
-    sim.run(until=0.1)
+    for _ in range(50):
+        assert sim.step()["converged"]
     bears = (8.0 * 0.45 + sim.local.mass[0]) * G  # about the hinge, the arm of the floor is 1 m
     assert -sim.body("floor").force[2] == pytest.approx(bears, rel=1e-4)
 
@@ -378,10 +380,49 @@ def test_a_motor_presses_a_head_on_the_floor_with_the_force_of_the_closed_form()
     assert sim.joint("shoulder").angle == pytest.approx(-0.3, abs=1e-9)
 
 
-def test_other_solvers_refuse():
-    for solver in set(ccp.SOLVERS) - {"auto", "apgd"}:
-        with pytest.raises(OptionError, match=f"-ccp_type {solver}: the scene has joints; allowed are auto, apgd"):
-            simulation(wheel(), solver=solver)
+@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parametrize("rolling", [0.0, 0.01])
+def test_rows_of_the_map_are_those_of_its_products(rolling):
+    """Of a chain, a pair, and a body that the world holds, among grains that no joint joins."""
+    comm = MPI.COMM_WORLD
+    scene = Scene(0.5, rolling=rolling)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_body("lid", [Box((0.4, 0.4, 0.05))], Dynamic(), position=(0.3, 0.3, 0.25), density=500.0)
+    grid = np.stack(np.meshgrid(*[0.2 * np.arange(4)] * 2, [0.1], indexing="ij"), axis=-1).reshape(-1, 3)
+    grains = scene.add_spheres(grid, 0.1, 1000.0, velocity=(0.3, 0.1, -0.4))
+    for k, (one, other) in enumerate([(0, 5), (5, 6), (6, 15), (2, 3), (None, 12), ("lid", 9)]):
+        ends = [one if one in (None, "lid") else grains[one], grains[other]]
+        scene.add_joint(f"joint {k}", *ends, kind="hinge", anchor=grid[other] + [0.05, 0.1, 0], axis=(0, 1, k))
+    sim = pctt.Simulation(scene, comm=comm, dt=0.005, say=lambda text: None)
+    sim.step()
+    G, random = sim.stepper.system.problem_map, np.random.default_rng(comm.rank)
+    assert comm.allreduce(len(sim.stepper.system.key)) > 30
+    rows = BlockMap(comm, G.block_rows)
+    v, g = random.normal(size=(G.columns, 6)), random.normal(size=(G.rows, 3))
+    np.testing.assert_allclose(rows.velocities(v), G.velocities(v), atol=1e-12)
+    np.testing.assert_allclose(rows.momenta(g), G.momenta(g), atol=1e-12)
+    away = comm.allreduce(int((np.diff(G.block_rows.indptr) <= 2).sum()))
+    assert away > 0  # contacts that see no joint have the blocks of their two bodies
+
+
+def test_much_friction_of_jointed_boxes_is_solved_by_interior_points():
+    """Boxes that the world holds in a corner fall on each other: first-order methods circle about Coulomb's law."""
+    scene = Scene(3.0)
+    scene.add_body("walls", [Plane((0, 0, 1)), Plane((1, 0, 0)), Plane((0, 1, 0))])
+    turned = np.random.default_rng(1).normal(size=(8, 4))
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    places = 0.15 + 0.29 * np.indices((2, 2, 2)).reshape(3, -1).T
+    boxes = scene.add_boxes(places, (0.1, 0.06, 0.08), 1000.0, quaternions=turned, velocity=(-1.0, -2.0, -1.0))
+    scene.add_joint("pin", None, boxes[0], kind="ball", anchor=(0.3, 0.1, 0.3))
+    scene.add_joint("rod", boxes[3], boxes[6], kind="fixed", anchor=(0.3, 0.3, 0.3))
+    sim = pctt.Simulation(scene, dt=0.01, comm=MPI.COMM_SELF, say=lambda text: None)
+    newton = 0
+    for _ in range(40):
+        figures = sim.step()
+        assert figures["converged"], figures["reason"]
+        assert figures["iterations"] < 2000
+        newton += figures["newton_its"]
+    assert newton > 0
 
 
 def test_a_body_that_is_squeezed_against_its_joint_has_no_solution():

@@ -11,6 +11,7 @@ import pctt
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world
+from pctt.run import rest
 
 
 def overlapping_pair(depth):
@@ -36,15 +37,16 @@ def test_overlapping_spheres_part_at_the_recovery_speed_at_most(solver, depth, s
 
 
 @pytest.mark.parametrize("solver", ["apgd", "auto"])
-def test_light_spheres_that_collide_beside_heavy_ones_overlap_by_little(solver):
+def test_light_spheres_that_collide_beside_heavy_ones_overlap_by_little(monkeypatch, solver):
     """Heavy spheres at rest, and two that have a millionth of their mass and fly at each other. Their impulse is
     nothing next to those of the heavy ones, which a step begins with. Without a limit of the closing speed the two
-    overlap by more than a twentieth of a radius."""
+    overlap by more than a twentieth of a radius, where steps are not accurate as those of bodies at rest."""
     scene = Scene(0.3)
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_spheres([[x, 0, RADIUS] for x in np.arange(10) * 3 * RADIUS], RADIUS, 1e5)
     scene.add_spheres([[0, 1, 0.5], [0, 1 + 2.5 * RADIUS, 0.5]], RADIUS, 0.1, velocity=[[0, 1, 0], [0, -1, 0]])
     deep = []
+    monkeypatch.setattr(rest, "SLOW", 0.0)
     for speed in (None, np.inf):
         with pctt.Simulation(scene, comm=MPI.COMM_SELF, dt=0.01, solver=solver, closing_speed=speed) as sim:
             for _ in range(8):

@@ -128,7 +128,7 @@ def test_the_recommended_stiffness_holds_the_bed_and_the_tool():
     scene = column(None, count=20)
     stiffness = recommended(scene)
     assert pairs(scene).stiffness.tolist() == [[stiffness]]
-    assert expected_overlap(scene, stiffness) == pytest.approx(0.003, rel=0.05)
+    assert expected_overlap(scene, stiffness, 0.01) == pytest.approx(0.003, rel=0.05)
     assert stiffness == pytest.approx(4 * 20 * MASS * G / (0.003 * R), rel=0.05)
     with pctt.Simulation(scene, dt=0.01, solver="apgd", **EXACT) as sim:
         sim.run(steps=100)
@@ -143,7 +143,7 @@ def test_the_recommended_stiffness_holds_the_bed_and_the_tool():
     bed = column(None, count=20)
     bed.add_body("tool", [Box((1.0, 1.0, 1.0))], Glide((0, 3.0, 0)), position=(0, 5, 0))
     assert recommended(bed) == pytest.approx(RESISTS * stiffness, rel=0.05)  # a bed gives way before a chain does
-    assert expected_overlap(bed, recommended(bed)) == pytest.approx(0.003, rel=0.05)
+    assert expected_overlap(bed, recommended(bed), 0.01) == pytest.approx(0.003, rel=0.05)
     alone = column(None, count=1)
     alone.add_body("tool", [Box((1.0, 1.0, 1.0))], Glide((0, 30.0, 0)), position=(0, 5, 0))
     assert recommended(alone) == pytest.approx(MASS * (STOPPED * 30.0 / (0.003 * R)) ** 2, rel=0.05)
@@ -200,3 +200,24 @@ def test_the_balance_of_energy_of_a_step_has_its_springs_before_and_after():
             assert change == pytest.approx(gain - loss, abs=1e-9 * before["potential_energy [J]"])
             before = now
         assert now["spring_energy [J]"] > 0.0
+
+
+def test_the_springs_of_impacts_hold_no_energy_that_nobody_gave():
+    """Tetrahedra that fly together: the energy of motion, weight and springs never rises, and no impact is a gain. What
+    the tolerance and turning edges leave of overlaps would be joules, times such a stiffness."""
+    rng = np.random.default_rng(5)
+    place = 3.0 * R * (np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) - 1.0)
+    scene = Scene(friction=0.4, stiffness=1e9)
+    scene.add_body("floor", [Plane((0, 0, 1), (0, 0, -5.0 * R))])
+    corners = R * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]])
+    scene.add_polyhedra(place, corners, DENSITY, velocity=-6.0 * place + rng.normal(size=place.shape))
+    with pctt.Simulation(scene, dt=0.002) as sim:
+        whole, gained = [], []
+        for _ in range(80):
+            row = sim.step()
+            names = "kinetic_energy", "potential_energy", "spring_energy"
+            whole.append(sum(row[f"{name} [J]"] for name in names))
+            gained.append(-row["impact_loss [J]"])
+    scale = whole[0] - whole[-1]
+    assert np.diff(whole).max() < 1e-3 * scale
+    assert max(gained) < 1e-3 * scale

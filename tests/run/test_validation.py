@@ -136,3 +136,38 @@ def test_a_packing_without_friction_has_as_many_contacts_as_degrees_of_freedom(m
     assert found.contacts == pytest.approx(6.0, rel=0.03)
     assert found.fraction == pytest.approx(0.64, abs=0.015)
     assert packings.exponential_tail(found.force)[1] == pytest.approx(1.6, abs=0.4)
+
+
+def test_impacts_keep_momentum_and_lose_what_walton_says():
+    """Unequal spheres with spins; and a sphere that sticks to a plate keeps 5/7 of its speed along it."""
+    from validation.impacts import DENSITY, Meeting, closed_form, on_plate
+
+    case = Meeting((0.02, 0.05), ((0.1, 0.2, 1.0), (0.0, -0.1, -0.5)), ((3.0, -2.0, 1.0), (1.0, 4.0, 0.0)), 0.7, 0.2)
+    radius = np.array(case.radii)
+    mass = DENSITY * 4 / 3 * np.pi * radius**3
+    before, after = np.concatenate([case.velocity, case.spin], axis=1), closed_form(case)
+    np.testing.assert_allclose(mass @ after[:, :3], mass @ before[:, :3])
+    arms = np.array([[0, 0, -radius[0]], [0, 0, radius[1]]])  # of the centres about the place of touch
+    turning = [
+        sum(m * np.cross(arm, row[:3]) + 0.4 * m * r**2 * row[3:] for m, r, arm, row in zip(mass, radius, arms, rows))
+        for rows in (before, after)
+    ]
+    np.testing.assert_allclose(turning[1], turning[0])
+    assert after[1, 2] - after[0, 2] == pytest.approx(0.7 * 1.5)
+    stuck = closed_form(on_plate(0.01, 2.0, 10.0, 0.5, 0.9))[0]
+    assert stuck[0] == pytest.approx(5 / 7 * 2.0 * np.sin(np.radians(10)))
+    assert stuck[2] == pytest.approx(-0.5 * 2.0 * np.cos(np.radians(10)))
+    assert abs(stuck[4]) * 0.01 == pytest.approx(stuck[0])  # its surface is at rest
+
+
+def test_the_structures_touch_and_do_not_overlap():
+    from mpi4py import MPI
+    from validation import structures
+
+    from dem.contact import find_contacts
+    from dem.start import new_world
+
+    for scene in (structures.arch(0.11), structures.overhang(0.9), structures.cards(20.0, 0.5)):
+        gap = find_contacts(new_world(scene, MPI.COMM_SELF), 1e-6).gap
+        assert len(gap) > 2
+        assert abs(gap).max() < 2e-6

@@ -72,7 +72,9 @@ class Newton:
     def begin(self, problem: ConeProblem) -> ConeProblem:
         """Take the next problem; its structure is kept where contacts and bodies are those of the last.
 
-        Returns the problem as its systems know it: given by N where its contacts are few."""
+        Returns the problem as its systems know it: given by N where its contacts are few, by the rows of its map where
+        joints or a cell couple bodies."""
+        problem = problem.by_rows()
         few = self._few(problem)
         instead = self.form == "body" and (few is not None or problem.contact_map is None)
         if instead != self._instead:
@@ -97,15 +99,19 @@ class Newton:
 
     def has_few(self, problem: ConeProblem) -> bool:
         """Whether the systems of this problem get the factors of `FewForm`."""
-        return self._few(problem) is not None
+        return self._few(problem.by_rows()) is not None
 
     def _few(self, problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:
         """N and an order of elimination, if the contacts are few; that of the last problem is kept."""
         if self._looked[0] is not problem.operator:
-            own = problem.comm.size == 1 and self.form == "body" and self._own
-            few = own and len(problem.r) == problem.cones.count <= Settings.few
+            few = self.takes_few and problem.comm.size == 1 and len(problem.r) == problem.cones.count <= Settings.few
             self._looked = (problem.operator, _eliminated(problem) if few else None)
         return self._looked[1]
+
+    @property
+    def takes_few(self) -> bool:
+        """Whether systems of few contacts on one rank get factors of their own."""
+        return self.form == "body" and self._own
 
     @property
     def takes_any(self) -> bool:
@@ -258,12 +264,10 @@ def _eliminated(problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:
     """N and the order of `pctt.ccp.newton.few` of a problem on one rank, if it is cheap enough."""
     if isinstance(problem.operator, GivenMatrix):
         known = problem.operator
-    elif problem.operator.has_rows:
+    else:
         G = problem.operator.block_rows
         if np.square(np.bincount(G.indices)).sum() > 2 * Settings.pairs + len(G.indices):
             return None
         known = GivenMatrix(problem.comm, all_blocks(G))
-    else:
-        return None
     order = ordered(known.local.indptr, known.local.indices, Settings.pairs, Settings.rest)
     return None if order is None else (known, order)

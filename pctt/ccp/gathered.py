@@ -1,0 +1,56 @@
+"""A problem of few contacts that are on several ranks, whole on the first one.
+
+There its Newton systems have the factors of `pctt.ccp.newton.few`, which are those of one rank: a step of the conic
+method then takes as long as the messages of one product of all ranks."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+
+from dem.exchange import offsets
+from pctt.blocks import square_block_matrix
+from pctt.ccp.cone import Array
+from pctt.ccp.delassus import rows_in_blocks
+from pctt.ccp.interior import conic
+from pctt.ccp.newton import Newton
+from pctt.ccp.newton.linear import Settings
+from pctt.ccp.problem import ConeProblem
+from pctt.ccp.result import Limits, Result, Status
+from pctt.ccp.rolling import RollingProblem
+
+
+def takes(problem: ConeProblem, newton: Newton) -> bool:
+    """Whether a problem has few contacts, on several ranks; the same on all."""
+    few = newton.takes_few and problem.comm.size > 1 and problem.size <= Settings.few
+    return few and not isinstance(problem, RollingProblem) and not problem.by_rows().has_hubs
+
+
+def solve(
+    problem: ConeProblem, guess: Array, limits: Limits, options: conic.Conic, newton: Newton, coulomb: bool = False
+) -> Result:
+    """What `conic` makes of the whole problem on the first rank; GIVEN_UP if its systems are not cheap. Collective."""
+    comm, known = problem.comm, problem.by_rows()
+    N = known.rigid_matrix()
+    parts = comm.gather((rows_in_blocks(N), known.r, known.mu, known.compliance, guess))
+    N.destroy()
+    found = Result(guess, Status.GIVEN_UP, "no order of elimination is cheap", np.inf, 0)
+    if parts is not None:
+        rows, r, mu, soft, start = zip(*parts)
+        N = square_block_matrix(MPI.COMM_SELF, sp.vstack(rows, format="bsr"))
+        given = np.concatenate(r), np.concatenate(mu)
+        whole = ConeProblem(MPI.COMM_SELF, *given, N=N, compliance=np.concatenate(soft)[:, :2])
+        N.destroy()
+        own = Newton(MPI.COMM_SELF, "body")
+        if own.has_few(whole):
+            found = conic.solve(whole, np.concatenate(start), limits, options, own, coulomb=coulomb)
+        own.destroy()
+        whole.destroy()
+    found = comm.bcast(found)
+    if found.status is Status.GIVEN_UP:
+        found.impulse = guess
+    else:
+        first = offsets(comm, len(problem.r))[comm.rank]
+        found.impulse = found.impulse[first : first + len(problem.r)].copy()
+    return found

@@ -1,0 +1,203 @@
+"""Bodies at rest by the defaults: the floor bears their weight in every step, nothing creeps, iterations are few."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import pctt
+from dem import record as recording
+from dem.motion import Guided, Rotation
+from dem.scene import Scene
+from dem.shapes import Box, Plane, Sphere
+from pctt.run import rest
+
+G, H = 9.81, 0.05  # m/s^2, half the side of boxes [m]
+
+
+def on_floor():
+    scene = Scene(friction=0.5)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    return scene
+
+
+def column(count=14, radius=0.05):
+    scene = on_floor()
+    scene.add_spheres([[0, 0, radius * (1 + 2 * k)] for k in range(count)], radius, 2500.0)
+    return scene
+
+
+def tower(*densities):
+    scene = on_floor()
+    scene.add_boxes([[0, 0, H * (1 + 2 * k)] for k in range(len(densities))], (H, H, H), densities)
+    return scene
+
+
+def overhang(part, count=8):
+    """Blocks of which each stands out over the one below by this part of the harmonic limit 1 / k half lengths."""
+    scene = on_floor()
+    shift = [0.0, *(part * H / k for k in range(count - 1, 0, -1))]
+    places = [[x, 0, H * (0.5 + k)] for k, x in enumerate(np.cumsum(shift))]
+    scene.add_boxes(places, (H, H, 0.5 * H), 2000.0)
+    return scene
+
+
+def wall(rows=12, columns=12):
+    """More contacts than `pctt.ccp.newton.few` takes."""
+    scene = on_floor()
+    places = [
+        [2 * H * (i + 0.5 * (k % 2)), 0, H * (0.5 + k)] for k in range(rows) for i in range(columns - k % 2)
+    ]  # fmt: skip
+    scene.add_boxes(places, (0.98 * H, 0.5 * H, 0.5 * H), 2000.0)
+    return scene
+
+
+def at_rest(scene, seconds, begin, **settings):
+    """The run, and from its time `begin` [s] on the force on the floor over the weight, step by step."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sim = pctt.Simulation(scene, **settings)
+        weight, share, iterations = G * sim.comm.allreduce(sim.world.grains.mass.sum()), [], []
+        sim.run(until=begin)
+        start = sim.positions.copy()
+        while sim.time < seconds:
+            figures = sim.step()
+            assert figures["converged"]
+            assert figures["energy_jump"] == 0.0
+            share.append(-sim.body("floor").force[2] / weight)
+            iterations.append(figures["iterations"])
+    creep = np.abs(sim.positions - start).max() / (sim.time - begin)
+    energy = sim.kinetic_energy / (weight * H)
+    return sim, np.array(share), creep, energy, np.mean(iterations)
+
+
+@pytest.mark.parametrize(
+    ("scene", "most"),
+    [
+        (column(), 12),
+        (tower(*[1000.0] * 16), 12),
+        (tower(1000.0, 3e5), 12),
+        (tower(1000.0, 3e6), 60),
+        (tower(1000.0, 0.3), 12),
+        (tower(1000.0, 1000.0, 1000.0, 4e4), 12),
+        (overhang(0.93), 25),
+    ],
+    ids=["column", "tower", "1:300", "1:3000", "light on heavy", "heaviest on top", "overhang"],
+)
+def test_the_floor_bears_the_weight_in_every_step_and_nothing_creeps(scene, most):
+    sim, share, creep, energy, iterations = at_rest(scene, 0.9, 0.3)
+    assert abs(share.mean() - 1.0) < 1e-3
+    assert share.std() < 1e-3  # 0.03 to 0.3 where steps stop as soon as the limits are met
+    assert creep < 1e-6
+    assert energy < 1e-9
+    assert iterations < most  # and 15 to 80
+    assert sim.figures["unbalanced_force"] < 1e-3
+
+
+@pytest.mark.parallel(2, 3)
+def test_things_at_rest_on_several_ranks():
+    """Few contacts of several ranks are solved by the first one: APGD needs thousands of iterations here."""
+    for scene in (tower(1000.0, 3e6), column(8)):
+        _, share, creep, _, iterations = at_rest(scene, 0.2, 0.12)
+        assert share.std() < 1e-3
+        assert creep < 5e-6
+        assert iterations < 30
+
+
+def test_many_contacts_at_rest():
+    _, share, creep, energy, iterations = at_rest(wall(), 0.9, 0.5)
+    assert share.std() < 1e-4
+    assert creep < 1e-6
+    assert energy < 1e-9
+    assert iterations < 45
+
+
+def test_a_stack_falls_that_hangs_over_too_far():
+    sim = pctt.Simulation(overhang(1.06))
+    sim.run(until=0.7)
+    assert sim.positions[-1, 2] < (8 - 1) * H
+
+
+@pytest.mark.parametrize("heavy", [1e9, 1e10])
+def test_a_light_box_under_a_heavy_one_stays(heavy):
+    """By more than six powers of ten: it is not thrown out, and the floor bears the weight."""
+    sim = pctt.Simulation(tower(1000.0, heavy))
+    sim.run(until=0.3)
+    share = []
+    sim.run(until=0.6, call=lambda s: share.append(-s.body("floor").force[2] / (G * s.world.grains.mass.sum())))
+    assert np.std(share) < 5e-3
+    assert abs(sim.positions[0, 2] - H) < 0.02 * H
+
+
+def test_a_pinched_grain_does_not_creep():
+    scene = Scene(friction=0.5)
+    scene.add_capsules([[0, 0, 0]], 0.02, 0.05, 1000.0)
+    scene.add_body("left", [Box((0.02, 0.1, 0.1), center=(-0.04, 0, 0))])
+    scene.add_body("right", [Box((0.02, 0.1, 0.1), center=(0.04, 0, 0))], Guided((1, 0, 0), force=-150.0), mass=1.0)
+    sim = pctt.Simulation(scene)
+    sim.run(until=0.5)
+    start = sim.positions.copy()
+    sim.run(until=1.5)
+    assert np.abs(sim.positions - start).max() < 1e-6
+
+
+def test_what_moves_is_solved_to_the_limits_alone():
+    """A ball that flies, a tool that turns beside a column: no step has an aim beyond the limits."""
+    flying = on_floor()
+    flying.add_spheres([[0, 0, 0.5]], 0.05, 2500.0, velocity=(1, 0, 0))
+    passing = column(3)
+    passing.add_body("tool", [Sphere(0.05)], Rotation((0, 0, 60)), position=(0.1005, 0, 0.05))
+    for scene in (flying, passing):
+        sim = pctt.Simulation(scene)
+        sim.step()
+        limits = rest.limits_of(sim.settings.limits, sim.world, sim.stepper.system)
+        assert limits.aim == 1.0
+
+
+def test_iterations_that_lead_nowhere_are_counted():
+    sim = pctt.Simulation(column(2))
+    sim.run(steps=60)
+    world, limits = sim.world, rest.limits_of(sim.settings.limits, sim.world, sim.stepper.system)
+    assert (limits.aim, limits.spare) == (rest.AIM, rest.ATTEMPT)
+    failed = pctt.ccp.Result(np.zeros((0, 3)), pctt.ccp.Status.CONVERGED, "", 1e-4, 160, beyond=100)
+    before = world.spare = 500.0
+    rest.account(world, limits, failed)
+    assert world.spare == before - 100 + rest.SHARE * 160
+    world.spare = rest.ATTEMPT - 1.0
+    assert rest.limits_of(sim.settings.limits, world, sim.stepper.system).spare == 0
+    failed.residual = limits.aimed
+    rest.account(world, limits, failed)
+    assert world.spare == rest.SPARE
+
+
+def test_the_count_is_in_checkpoints(tmp_path):
+    scene = column(3)
+    sim = pctt.Simulation(scene)
+    sim.run(steps=2)
+    sim.world.spare = 123.0
+    sim.save(tmp_path / "state.h5")
+    assert pctt.Simulation.load(tmp_path / "state.h5", scene).world.spare == 123.0
+
+
+@pytest.mark.parametrize(
+    ("program", "words"), [(False, "a smaller dt=, a stiffness="), (True, "a smaller -dt, a -stiffness")]
+)
+def test_jumps_are_told_once_in_the_language_of_the_door(monkeypatch, program, words):
+    row = recording.row
+    monkeypatch.setattr(recording, "row", lambda *given: row(*given) | {"energy_jump [J]": 3.0})
+    sim = pctt.Simulation(column(2), program=program)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        sim.run(steps=3)
+    assert [words in str(one.message) for one in told] == [True]
+
+
+def test_a_swing_on_the_springs_is_no_jump():
+    """A column that falls by less than a thousandth of a radius: its energy rises tenfold, and is next to nothing."""
+    scene = on_floor()
+    scene.add_spheres([[0, 0, 0.05002 + 0.10001 * k] for k in range(10)], 0.05, 2500.0)
+    jumps = []
+    pctt.Simulation(scene, dt=1e-4).run(steps=60, call=lambda s: jumps.append(s.figures["energy_jump"]))
+    assert max(jumps) == 0.0
