@@ -86,7 +86,7 @@ def hulls_of(solids: tuple[Solid, ...]) -> Hulls:
     sharp = np.array([np.linalg.norm(own, axis=1).max() for own in inset])
     radius = np.array([np.linalg.norm(own.vertex, axis=1).max() for own in each])
     inner = np.array([np.einsum("fk,fk->f", own.normal, own.vertex[own.corner[:, 0]]).min() for own in each]) / radius
-    columns = [*([own[k] for own in each] for k in range(6)), inset]
+    columns: list[Sequence[np.ndarray]] = [*([own[k] for own in each] for k in range(6)), inset]
     return Hulls(radius, inner, sharp, counts, *map(padded, columns))
 
 
