@@ -64,7 +64,7 @@ def seen_from(
     for p in range(len(i)):
         a, b = i[p], j[p]
         A, B = row[a], row[b]
-        h, speed = _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt)
+        h, speed = _ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
         u, w, way[p] = _vector(velocity[A], 3), _vector(velocity[B], 3), h * speed
         far = plus(_vector(place[A], 0), h, _vector(velocity[A], 0))
         far = plus(far, 1.0, _after(plus(center[a], -1.0, place[A]), u, h))
@@ -98,7 +98,7 @@ def turn_ahead(
         a, b = (two, one) if swap else (one, two)
         A, B, sign = row[a], row[b], -1.0 if swap else 1.0
         V, W, u, w = _vector(velocity[A], 0), _vector(velocity[B], 0), _vector(velocity[A], 3), _vector(velocity[B], 3)
-        h, _ = _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt)
+        h, _ = _ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
         here = kind[a] == SPHERE and kind[b] in (SPHERE, PLANE, BOX)
         if here:
             lever, other = plus(center[a], -1.0, place[A]), plus(center[b], -1.0, place[B])
@@ -152,7 +152,7 @@ def _from_host(end, kind, quaternion, size, radius, spin, time):
 
 
 @inlined
-def _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt):
+def _ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt):
     """The time by which a pair of a guest a and a host b is foreseen: dt, or less where the surface of the one goes
     further along the other than FURTHEST allows; and the speed at which it goes."""
     least, other = _thickness(kind[a], size[a], inner), _thickness(kind[b], size[b], inner)
@@ -165,13 +165,25 @@ def _ahead_by(a, b, kind, row, center, size, radius, inner, place, velocity, dt)
     u, w = _vector(velocity[A], 3), _vector(velocity[B], 3)
     drift = plus(_vector(velocity[A], 0), 1.0, cross(u, plus(center[a], -1.0, place[A])))
     drift = plus(drift, -1.0, _vector(velocity[B], 0))
-    seat = center[b] if kind[b] == SPHERE else center[a]  # the spin of a sphere moves no surface
+    seat = center[b] if kind[b] in (SPHERE, CAPSULE) else center[a]  # the spin of a sphere moves no surface
     drift = plus(drift, -1.0, cross(w, plus(seat, -1.0, place[B])))
+    if kind[b] == CAPSULE:
+        drift = plus(drift, -1.0, cross(_across(w, quaternion[b]), plus(center[a], -1.0, center[b])))
     speed = np.sqrt(dot(drift, drift))
     if kind[a] != SPHERE:
         spin = plus(u, -1.0, w)
+        if kind[a] == CAPSULE:
+            spin = _across(spin, quaternion[a])
         speed += radius[a] * np.sqrt(dot(spin, spin))
     return (dt if speed * dt <= FURTHEST * least else FURTHEST * least / speed), speed
+
+
+@inlined
+def _across(spin, q):
+    """The part of an angular velocity that moves the surface of a capsule: not that about its axis."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    axis = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+    return plus(spin, -dot(axis, spin), axis)
 
 
 @inlined

@@ -86,7 +86,8 @@ def hulls_of(solids: tuple[Solid, ...]) -> Hulls:
     sharp = np.array([np.linalg.norm(own, axis=1).max() for own in inset])
     radius = np.array([np.linalg.norm(own.vertex, axis=1).max() for own in each])
     inner = np.array([np.einsum("fk,fk->f", own.normal, own.vertex[own.corner[:, 0]]).min() for own in each]) / radius
-    return Hulls(radius, inner, sharp, counts, *(padded([own[k] for own in each]) for k in range(6)), padded(inset))
+    columns: list[Sequence[np.ndarray]] = [*([own[k] for own in each] for k in range(6)), inset]
+    return Hulls(radius, inner, sharp, counts, *map(padded, columns))
 
 
 def _inset(own: Faces) -> Floats:
@@ -581,9 +582,9 @@ def _edge_of(edges, edge, one, two):
 def _on_edges(points, many, others, count, edges, edge, axis, sign, slack, most, end, skin, other_skin, first, found,
               out, feature):  # fmt: skip
     """Add the vertices of a polyhedron, of those that are foremost along the axis (`sign` -1: against it) within the
-    slack, that are at most `most` from edges of the other one, which has such vertices too; the new number of contacts,
-    and the least distance; not those beside an end of an edge, by more than `end`. Their places are those of the polyhedra with their skins. `first` is the number of the first
-    vertex among the features."""
+    slack, that are at most `most` from edges of the other one, which has such vertices too, and not beside their ends
+    by more than `end`; the new number of contacts, and the least distance. Their places are those of the vertices and
+    edges of the polyhedra with their skins. `first` is the number of the first vertex among the features."""
     front, back, least = -np.inf, np.inf, np.inf
     for k in range(many):
         front = max(front, sign * dot(axis, points[k]))
@@ -592,7 +593,7 @@ def _on_edges(points, many, others, count, edges, edge, axis, sign, slack, most,
     for k in range(many):
         if sign * dot(axis, points[k]) < front - slack:
             continue
-        best, x, y, z, one, two, corner = np.inf, 0.0, 0.0, 0.0, 0, 0, False
+        best, x, y, z, one, two = np.inf, 0.0, 0.0, 0.0, 0, 0
         for e in range(edges):
             a, b = edge[e, 0], edge[e, 1]
             if min(sign * dot(axis, others[a]), sign * dot(axis, others[b])) > back + slack:
@@ -603,9 +604,10 @@ def _on_edges(points, many, others, count, edges, edge, axis, sign, slack, most,
             i, j, s = t * u - i, t * v - j, t * w - s
             square = i * i + j * j + s * s
             if square < best:
-                best, x, y, z, one, two, corner = square, i, j, s, a, b, t == 0.0 or t == 1.0
+                best, x, y, z = square, i, j, s
+                one, two = b if t == 1.0 else a, a if t == 0.0 else b
         gap = np.sqrt(best)
-        if corner:  # on a corner, along the axis, or beside it
+        if one == two:  # on a corner, along the axis, or beside it
             ahead = axis[0] * x + axis[1] * y + axis[2] * z
             if best - ahead * ahead > end * end:
                 continue

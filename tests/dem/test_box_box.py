@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from convex import distance, outside, signed_distance
+from convex import SIGNS, distance, outside, signed_distance
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from dem import quaternion
-from dem.contact.polyhedra import FLUSH, SNAP, Polyhedra, hulls_of, polyhedra_polyhedra
+from dem.contact.polyhedra import FLUSH, ROUND, SNAP, Polyhedra, hulls_of, polyhedra_polyhedra
 
 DELTA = 0.1
 BOXES = hulls_of(())
@@ -157,7 +157,7 @@ def test_the_least_gap_is_the_signed_distance_and_points_lie_between_the_surface
         assert len(set(feature)) == len(feature)
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, rtol=1e-12)
         for body, side in ((one, -0.5), (other, 0.5)):
-            assert outside(body, point + side * gaps[:, None] * normal).max() <= 3 * SNAP * size + max(-0.5 * gaps[0], 0.0)
+            assert outside(body, point + side * gaps[:, None] * normal).max() <= (3 * SNAP + 2 * ROUND) * size
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
@@ -182,3 +182,69 @@ def test_contacts_depend_neither_on_the_order_of_the_boxes_nor_on_the_frame(boxe
             np.testing.assert_allclose(back[nearest], point, atol=1e-6)
             np.testing.assert_allclose(sign * found[2][nearest] @ frame, normal, atol=1e-4)
             np.testing.assert_allclose(found[3][nearest], gaps, atol=1e-6)
+
+
+def leaning(angle, gap, higher=0.0, turn=None):
+    """Two cards that lean on each other, edge along edge, the second one `higher`, in a frame of any orientation."""
+    half, turn = np.array((0.1, 0.6, 1.0)), np.eye(3) if turn is None else turn
+    tips = [turned((0, side * angle, 0)) @ (side * half[0], 0.0, half[2]) for side in (1.0, -1.0)]
+    shift = np.array((gap, 0.0, higher))
+    return [
+        box(half, turn @ (place - tip), turn @ turned((0, side * angle, 0)))
+        for tip, side, place in zip(tips, (1.0, -1.0), (np.zeros(3), shift))
+    ]
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-8, 0.0, -1e-8, -1e-3])
+@pytest.mark.parametrize("angle", [0.2, 0.35, 0.6])
+def test_the_normal_of_edges_along_edges_is_the_mean_of_those_of_their_faces(angle, gap):
+    for seed in range(4):
+        turn = turned(3.0 * np.random.default_rng(seed).normal(size=3)) if seed else np.eye(3)
+        _, point, normal, _ = touch(*leaning(angle, gap, turn=turn))
+        assert len(point) == 2
+        np.testing.assert_allclose(normal @ turn, [[1, 0, 0]] * 2, atol=1e-9)
+        np.testing.assert_allclose(rows(point @ turn), [[gap / 2, -0.6, 0], [gap / 2, 0.6, 0]], atol=1e-9)
+
+
+@pytest.mark.parametrize("gap", [1e-3, 0.0, -1e-3])
+def test_the_normal_of_corners_on_corners_is_along_their_diagonal(gap):
+    for turn in (np.eye(3), turned((1.0, 2.0, -0.5))):
+        way = turn @ np.ones(3)
+        one, other = box((1, 1, 1), frame=turn), box((0.5, 0.5, 0.5), (1.5 + gap / 3**0.5) * way, turn)
+        _, point, normal, _ = touch(one, other)
+        np.testing.assert_allclose(normal, [way / 3**0.5], atol=1e-9)
+        np.testing.assert_allclose(point, [way * (1 + 0.5 * gap / 3**0.5)], atol=1e-9)
+
+
+@pytest.mark.parametrize("gap", [1e-3, 0.0, -1e-3])
+def test_normals_and_gaps_turn_steadily_from_the_face_of_one_to_that_of_the_other(gap):
+    """One edge passes over the other: the normal is that of a face, then turns over some hundredths of the half
+    thickness, and is that of the other face."""
+    angle, normals, gaps = 0.35, [], []
+    for higher in np.linspace(-0.01, 0.01, 401):  # the half thickness is 0.1
+        _, _, normal, least = touch(*leaning(angle, gap, higher))
+        normals.append(normal[0])
+        gaps.append(least[0])
+        assert np.ptp(normal, axis=0).max() < 1e-9
+    tilt = np.arctan2(np.array(normals)[:, 2], np.array(normals)[:, 0])
+    np.testing.assert_allclose(tilt[[0, 200, -1]], [-angle, 0.0, angle], atol=1e-9)
+    assert np.diff(tilt).min() > -1e-9
+    assert np.diff(tilt).max() < 0.05
+    assert np.abs(np.diff(gaps)).max() < 6e-5  # of steps of 5e-5
+
+
+@pytest.mark.parametrize("lower", [0.02, 0.0, -0.004])
+def test_a_corner_over_a_face_has_the_normal_of_the_face(lower):
+    """Also beside its border, and a box that stands on the border with half of its face."""
+    frame = turned((0, 0, 0.3), (0.5, 0.4, 0))
+    low = (SIGNS @ frame.T)[:, 2].argmin()
+    corner = frame @ SIGNS[low]
+    for beside in (0.5, 0.05):
+        over = box((1, 1, 1), np.array((1 - beside, 0.2, 1.0 + lower)) - corner, frame)
+        _, point, normal, gaps = touch(box((1, 1, 1)), over)
+        np.testing.assert_array_equal(normal[0], [0, 0, 1])
+        np.testing.assert_allclose(point[0], [1 - beside, 0.2, 1 + lower / 2], atol=1e-12)
+        np.testing.assert_allclose(gaps[0], lower, atol=1e-12)
+    _, _, normal, gaps = touch(box((1, 1, 1)), box((1, 1, 1), (1.0, 0, 2.0 + lower)))
+    np.testing.assert_array_equal(normal, [[0, 0, 1]] * 4)
+    np.testing.assert_allclose(gaps, lower, atol=1e-14)

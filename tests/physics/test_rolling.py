@@ -1,10 +1,16 @@
-"""A sphere on a plane: rolling, slipping, and the change from one to the other."""
+"""A sphere on a plane: rolling, slipping, and the change from one to the other; a capsule over joints."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from drive import RADIUS, SOLVERS, G, make_steps, on_incline, sphere, steps
+
+import pctt
+from dem import quaternion
+from dem.mesh import Mesh
+from dem.scene import Scene
+from dem.shapes import Box
 
 
 def slip(world):
@@ -58,3 +64,28 @@ def test_friction_does_not_act_on_spin_about_the_normal(solver):
     world = sphere(on_incline(0.0, 0.5), spin=(0.0, 0.0, 3.0))
     make_steps(world, 10, 0.01, solver)
     np.testing.assert_allclose(world.grains.velocity[0], [0, 0, 0, 0, 0, 3.0], atol=1e-7)
+
+
+@pytest.mark.parametrize("width", [0.1, 0.037])
+@pytest.mark.parametrize("floor", ["tiles", "meshes"])
+def test_a_capsule_rolls_over_joints_as_over_a_plane(floor, width):
+    """Flush tiles, and meshes that abut, askew too: its spin about its axis does not move its surface."""
+    scene, radius, yaw = Scene(0.4), 0.05, 0.0 if floor == "tiles" else 0.3
+    for n in range(-4, round(0.7 / width) + 4):
+        if floor == "tiles":
+            scene.add_body(f"{n}", [Box((width / 2, 1.0, 0.05), center=(width * (n + 0.5), 0, -0.05))])
+        else:
+            corners = [(width * (n + i), j, 0) for i, j in ((0, -1), (1, -1), (1, 1), (0, 1))]
+            scene.add_body(f"{n}", [Mesh(corners, [(0, 1, 2), (0, 2, 3)])])
+    way = np.array((np.cos(yaw), np.sin(yaw), 0))
+    about = quaternion.exponential(np.array((0, 0, yaw)))
+    turn = quaternion.multiply(about, quaternion.exponential(np.array((np.pi / 2, 0, 0))))
+    spin = np.cross((0, 0, 1), way) / radius
+    scene.add_capsules(
+        (0.013, 0, radius), radius, 0.1, 2500.0, quaternions=turn, velocity=way, angular_velocity=spin
+    )
+    sim = pctt.Simulation(scene)
+    energy = sim.kinetic_energy
+    sim.run(until=0.6)
+    assert sim.kinetic_energy == pytest.approx(energy, rel=1e-3)
+    np.testing.assert_allclose(sim.velocities[0, :3], way, atol=1e-3)
