@@ -38,6 +38,7 @@ HOLDS = {
 }
 
 ROUNDS = 8  #: of the iteration for what is not linear in the velocities, at most
+FAR = 0.5  #: radians in a step above which it does not converge, and the step takes joints as linear
 
 HELD, MOTOR, LOWER, UPPER = range(4)  #: kinds of rows: what a joint holds, its motor, its limits
 
@@ -246,6 +247,8 @@ def coupling(
         if np.abs(expected - last).max() <= 1e-7 * np.abs(expected).max():
             break
         after = velocity + np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
+        if dt * np.abs(after[:, 3:]).max(initial=0.0) > FAR:
+            break
         place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after[:, 3:], dt)
         error = geometry(joints, row, dataclasses.replace(ends, position=place, quaternion=turn), period).error
         bent = (error - found.error)[which, ways] / dt - J.reshape(len(t), -1) @ after.ravel()

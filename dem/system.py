@@ -50,6 +50,9 @@ from dem.servo import cell_of
 from dem.surface import surface_velocities
 from dem.world import World, turns_unlike_spheres
 
+#: Bodies that contacts turned by more radians in the last step were struck: those impulses do not come again.
+STRUCK = 0.05
+
 
 class ContactSystem:
     """The contact problem of one step on this rank. The constructor is collective; other members say so.
@@ -121,6 +124,8 @@ class ContactSystem:
         if self.push is not None:
             change = np.empty_like(self.push)
             scale(self.contact_map.given.root, self.push, change)
+            struck = dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
+            self.push[struck], change[struck] = 0.0, 0.0
         free, self.middle = free_velocities(world, near, dt, self.drives, change)
         self.applied = applied_impulses(world, dt) if world.loaded else None
         if world.loaded or change is not None:
