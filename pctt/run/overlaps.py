@@ -9,7 +9,7 @@ import numpy as np
 from dem.overlaps import overlaps
 from dem.scene import Scene, least_half
 from dem.step import Step
-from dem.stiffness import OVERLAP, expected_overlap
+from dem.stiffness import expected_overlap
 from dem.time_step import DRIVEN, smallest
 from pctt.run.report import mending
 from pctt.run.settings import CLOSING, Settings
@@ -44,8 +44,8 @@ class OverlapWatch:
         self._told: set[str] = set()
 
     def look(self, step: Step, closing_speed: float) -> str:
-        """The field of `Settings` that helps, if a step shows more than TWICE of what is promised (and of OVERLAP, what
-        scenes have by default) and it was not told yet; the same on all ranks; collective."""
+        """The field of `Settings` that helps, if a step shows more than TWICE of what is promised and it was not told
+        yet; the same on all ranks; collective."""
         found, held = overlaps(step, self._large)
         if self._start is None:
             self._start = found
@@ -54,15 +54,14 @@ class OverlapWatch:
         self._held, self._loose = held, closing_speed * self._dt / self._size
         if found > self._worst:
             self._worst, self.cause = found, cause
-        promised = self.springs + (0.0 if cause == "stiffness" else self.steps)
-        if found <= max(TWICE * max(promised, OVERLAP), self._start) or cause in self._told:
+        if found <= max(TWICE * (self.springs + self.steps), self._start) or cause in self._told:
             return ""
         self._told.add(cause)
         return cause
 
     def words(self, cause: str, step: int, program: bool) -> str:
         """What is said of that; the program has other names of options than Python."""
-        promised = self.springs + (0.0 if cause == "stiffness" else self.steps)
+        promised = self.springs + self.steps
         return (
             f"step {step}: bodies overlap by {self._worst:.2g} half thicknesses, where up to {promised:.2g} were "
             f"expected: {CAUSES[cause]}. What helps: {mending(cause, program)}"

@@ -103,7 +103,7 @@ def test_the_contacts_of_a_box_at_rest_bear_its_weight(solver):
     np.testing.assert_allclose(contacts.gap, 0, atol=1e-7)
     np.testing.assert_allclose(contacts.point[:, 2], 0, atol=1e-7)
     assert sim.figures["converged"]
-    assert sim.figures["solver"] in (solver, "apgd")
+    assert sim.figures["solver"] in (solver, "apgd", "conic")
 
 
 # -- motions ------------------------------------------------------------------------------------------------
