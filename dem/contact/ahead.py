@@ -112,12 +112,14 @@ def turn_ahead(
             end = plus(plus(plus(plus(center[a], -1.0, center[b]), h, V), -h, W), -1.0, beside)
             end = plus(plus(end, 1.0, plus(ahead, -1.0, lever)), 1.0, other)
             n, after = _from_host(end, kind[b], quaternion[b], size[b], size[a, 0], w, h)
-            if max(gap[c], after) <= TOUCH * size[a, 0]:
+            near, reach = TOUCH * size[a, 0], after
+            if max(gap[c], after) <= near and gap[c] - after <= near:  # else an impact begins
                 n = (sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2])
+                end, beside, reach = plus(center[a], -1.0, center[b]), other, gap[c]
             half = 0.5 * min(gap[c], 0.0)
             own = plus(lever, size[a, 0] + half, n)  # forces act at the start: those of a top at the end brake it
             base = other if kind[b] == SPHERE else beside
-            their = plus(plus(base, 1.0, end), size[a, 0] + after - half, n)
+            their = plus(plus(base, 1.0, end), size[a, 0] + reach - half, n)
         else:
             n = _after((sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]), w, h)
             their = _after(plus(point[c], -1.0, place[B]), w, h)
