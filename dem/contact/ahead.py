@@ -7,11 +7,9 @@ end, gaps and directions belong to the same instant, as in the implicit method o
 a step early, and bears load for as long as it should.
 
 The end is foreseen with the velocities before the step. Gaps are linear in the velocities about the places foreseen, so
-where velocities do not change no overlap is left at the end. The price would be that the energy of a body that slides
-freely along a curve is kept to first order in the step only. So a contact of a sphere that touches at the start and at
-the end has the direction of the start, with the gap of the end: the impulse acts at the instant between the two
-velocities, as in the method SHAKE, which is of second order. Only contacts that begin or end within the step have the
-direction of the end. Of other pairs all have that, as their contacts are found there alone.
+where velocities do not change no overlap is left at the end. The price: the energy of a body that slides freely along a
+curve, and angular momentum about a contact, are kept to first order in the step only. What balances forces does not
+depend on that. docs/mechanics.md has what directions of the start of lasting contacts alone would do.
 
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
@@ -35,10 +33,6 @@ FURTHEST = 0.25
 
 #: Half thicknesses of a guest by which a linear gap may overlap before the overlap at the start is looked up.
 DEEP = 0.005
-
-#: Radii by which spheres are apart at most where they touch: from the start of a step to its end they have the
-#: direction of the start.
-TOUCH = 0.01
 
 #: Of spheres, boxes, -, capsules, half spaces, meshes, polyhedra: of a pair the one of lower rank is the guest.
 RANK = np.array([0, 2, 9, 1, 4, 5, 3])
@@ -112,14 +106,10 @@ def turn_ahead(
             end = plus(plus(plus(plus(center[a], -1.0, center[b]), h, V), -h, W), -1.0, beside)
             end = plus(plus(end, 1.0, plus(ahead, -1.0, lever)), 1.0, other)
             n, after = _from_host(end, kind[b], quaternion[b], size[b], size[a, 0], w, h)
-            near, reach = TOUCH * size[a, 0], after
-            if max(gap[c], after) <= near and gap[c] - after <= near:  # else an impact begins
-                n = (sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2])
-                end, beside, reach = plus(center[a], -1.0, center[b]), other, gap[c]
             half = 0.5 * min(gap[c], 0.0)
             own = plus(lever, size[a, 0] + half, n)  # forces act at the start: those of a top at the end brake it
             base = other if kind[b] == SPHERE else beside
-            their = plus(plus(base, 1.0, end), size[a, 0] + reach - half, n)
+            their = plus(plus(base, 1.0, end), size[a, 0] + after - half, n)
         else:
             n = _after((sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]), w, h)
             their = _after(plus(point[c], -1.0, place[B]), w, h)
