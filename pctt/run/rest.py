@@ -55,18 +55,20 @@ def _kinetic_part(world: World, system: ContactSystem) -> float:
     grains, large, free = world.grains, world.large, system.free_large
     moves = np.flatnonzero(bodies.is_dynamic(large))
     driven = large.take(moves)
-    fall = falling_energy(grains.mass, grains.velocity, system.free_velocity[: len(grains)])
-    (kinetic, fall, mass), _ = reduced(
-        world.comm, (energy(grains, world.gravity)[0], fall, float(grains.mass.sum())), ()
+    first = float(world.comm.rank == 0)  # all ranks know the large bodies, and processors may round otherwise
+    sums = (
+        energy(grains, world.gravity)[0] + first * energy(driven, world.gravity)[0],
+        falling_energy(grains.mass, grains.velocity, system.free_velocity[: len(grains)])
+        + first * falling_energy(driven.mass, driven.velocity, free[moves]),
+        float(grains.mass.sum() + first * driven.mass.sum()),
     )
-    kinetic += energy(driven, world.gravity)[0]
-    fall += falling_energy(driven.mass, driven.velocity, free[moves])
+    (kinetic, fall, mass), _ = reduced(world.comm, sums, ())
     if kinetic >= SLOW * fall:  # so a bed that is stirred pays for two sums
         return np.inf
     tools = free.copy()
     tools[moves] = 0.0
     _, (fastest,) = reduced(world.comm, (), (_passing(system, tools),))
-    passes = 0.5 * (mass + float(driven.mass.sum())) * fastest**2 > fall
+    passes = 0.5 * mass * fastest**2 > fall
     return np.inf if passes else float(kinetic / fall)
 
 
