@@ -104,7 +104,8 @@ class Result:
 
     Attributes
     ----------
-    impulse : (nc, 3) impulses of this rank's contacts (N s)
+    impulse : (nc, 3) impulses of this rank's contacts (N s); (nc, 2) in the plane
+    velocity : the velocities y = N g + r of that shape (m/s); set by `pctt.ccp.solve`
     status : CONVERGED where the residual and the closing work of `Limits` are below theirs, else why not. SQUEEZED:
         bodies are pressed so hard, or have masses so far apart, that the closing work says nothing, or that forces on
         light bodies are wrong. No other method would do better
@@ -119,7 +120,7 @@ class Result:
     newton_its : the Newton steps among the iterations
     law : RELAXATION, COULOMB or FIXED_POINT: the law of the impulses and of the residuals
     accuracy : the figures of the impulses; set by `pctt.ccp.solve`
-    momentum : (6m,) G' g, or g where the problem is given by N; set by `pctt.ccp.solve`
+    momentum : (6m,) G' g, or g where the problem is given by N, in the units of the cones; set by `pctt.ccp.solve`
     beyond : iterations among them after the limits were met, towards the aim beyond these
     asked : what the asked method made of it, where another one had to follow; else None
     exhausted : whether it has tried the other methods, too
@@ -139,6 +140,7 @@ class Result:
     law: str = RELAXATION
     accuracy: Accuracy | None = None
     momentum: Array = field(default_factory=lambda: np.zeros(0))
+    velocity: Array = field(default_factory=lambda: np.zeros((0, 3)))
     beyond: int = 0
     asked: Result | None = None
     exhausted: bool = False

@@ -15,6 +15,7 @@ from dem.contact_map import find_halo
 from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
 from pctt.ccp.cone import Array
+from pctt.ccp.delassus import ColumnMap, sums_of
 from pctt.ccp.problem import ConeProblem
 
 
@@ -50,16 +51,18 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
 
 def _left_over(problem: ConeProblem, d: Array) -> float:
     """How much impulses d (nc, 3) leave on the bodies: the sum of |G_b' d|^2 / |G_b|^2 over the bodies b, with G_b the
-    columns of a body, of which the mass drops out; between 0 and 2 for ||d|| = 1. Collective."""
+    columns of a body, of which the mass drops out; between 0 and 2 for ||d|| = 1. Of a matrix a column is a body.
+    Collective."""
     assert problem.contact_map is not None
     known = problem.contact_map
     G = (known.free if isinstance(known, (CellMap, JointedMap)) else known).block_rows
     halo, body = find_halo(problem.comm, G.columns, G.indices)
-    each = np.bincount(body, (G.blocks**2).sum(axis=(1, 2)), halo.rows)
+    each = sums_of(body, (G.blocks**2).sum(axis=1), halo.rows)
     halo.add(each)
-    size = each[: G.columns]
-    momentum = np.square(problem.momentum(d).reshape(-1, 6)[: G.columns]).sum(axis=1)
-    return float(problem.sum(np.divide(momentum, size, out=np.zeros(len(size)), where=size > 0).sum()))
+    size, momentum = each[: G.columns], np.square(problem.momentum(d).reshape(-1, 6)[: G.columns])
+    if not isinstance(known, ColumnMap):
+        size, momentum = size.sum(axis=1), momentum.sum(axis=1)
+    return float(problem.sum(np.divide(momentum, size, out=np.zeros(size.shape), where=size > 0).sum()))
 
 
 @loop
