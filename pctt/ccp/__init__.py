@@ -130,12 +130,12 @@ def _by(
 
     try:
         with phase("CCPSolve"):
-            result = run(guess, limits, coulomb=True) if coulomb and method.has_law else None
+            found = run(guess, limits, coulomb=True) if coulomb and method.has_law else None
             # conic's own systems of Coulomb's law are those of bodies, or of few contacts
-            if coulomb and (result is None or (result.status is Status.GIVEN_UP and problem.contact_map is None)):
+            if coulomb and (found is None or (found.status is Status.GIVEN_UP and problem.contact_map is None)):
                 result = fixed_point(run, problem, guess, limits)
             else:
-                result = result or run(guess, limits)
+                result = found or run(guess, limits)
                 result.law = law
     finally:
         if own is not None:
