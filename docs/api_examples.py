@@ -520,10 +520,24 @@ from pctt import ccp
 # one contact of a mass of 2 kg that slides at 3 m/s and falls at 1 m/s: the impulses that stop the fall
 N = PETSc.Mat().createDense((3, 3), array=np.eye(3) / 2.0, comm=MPI.COMM_SELF)
 problem = ccp.ConeProblem(MPI.COMM_SELF, r=np.array([[-1.0, 3.0, 0.0]]), mu=np.array([0.5]), N=N)
-result = ccp.solve(problem, type="apgd", limits=ccp.Limits(tol=1e-10), law=ccp.COULOMB)
+result = ccp.solve(problem, limits=ccp.Limits(tol=1e-10))
 print(result.status, "after", result.iterations, "iterations:", result.impulse.round(6), "N s")
 accuracy = ccp.measure(problem, result.impulse)
 print("Coulomb residual", f"{accuracy.coulomb_residual:.0e}", "closing work", f"{accuracy.closing_work:.0e}")
+
+# %% pctt.ccp.Operator
+import numpy as np
+from mpi4py import MPI
+
+from pctt import ccp
+
+# eight contacts in a row on an elastic ground: what one is pressed with moves all, the less the farther they are
+distance = np.abs(np.subtract.outer(np.arange(8), np.arange(8)))
+near = 1.0 / (1.0 + distance**2)
+N = ccp.Operator(mult=lambda g: near @ g, blocks=np.tile(np.eye(3), (8, 1, 1)))
+problem = ccp.ConeProblem(MPI.COMM_SELF, r=np.tile([-1.0, 0.3, 0.0], (8, 1)), mu=np.full(8, 0.3), N=N)
+result = ccp.solve(problem)
+print(result.status, "with pressures", result.impulse[:, 0].round(3))
 
 # %% pctt.ccp.RollingProblem, dem.contact_map.TurningMap
 from mpi4py import MPI
