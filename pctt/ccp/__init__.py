@@ -25,7 +25,7 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.registry import MATRIX, NEWTON, SOLVERS, why_no_form, why_refused
 from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Limits, Result, Status
 from pctt.ccp.rolling import RollingProblem
-from pctt.ccp.unbounded import why_unbounded
+from pctt.ccp.unbounded import why_unanswered, why_unbounded
 from pctt.log import phase
 
 __all__ = [
@@ -116,6 +116,10 @@ def _by(
     if cold == 0:
         words = "no contact closes" if problem.size else "no contacts"
         result = Result(nothing, Status.CONVERGED, words, 0.0, 0, solver=name, law=law)
+        _measure(problem, result)
+        return result
+    if words := why_unanswered(problem, coulomb):
+        result = Result(nothing, Status.UNBOUNDED, words, cold, 0, solver=name, law=law)
         _measure(problem, result)
         return result
     limits = dataclasses.replace(limits, max_it=method.iterations) if limits.max_it < 0 else limits

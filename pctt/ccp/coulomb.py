@@ -108,6 +108,8 @@ class Anderson:
             return best
         changes = np.stack([df for _, df in self._steps])
         normal, right = self.problem.sum(changes @ changes.T), self.problem.sum(changes @ f)
+        if not (np.isfinite(normal).all() and np.isfinite(right).all()):
+            return best
         shares = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
         for share, (ds, df) in zip(shares, self._steps):
             best = best - share * (ds + self.relaxation * df)

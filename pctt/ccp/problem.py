@@ -69,6 +69,7 @@ class ConeProblem:
     yields : whether C is not zero, the same on all ranks
     cones : those of the contacts of this rank
     size : contacts on all ranks, Nc
+    unanswered : contacts on all ranks that no impulse moves: N has zeros in their rows
     mean_diagonal : mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts
     """
 
@@ -101,9 +102,11 @@ class ConeProblem:
         trace = _diagonals(self._rigid_blocks).sum()  # has squares of all numbers of G
         known = self.contact_map is not None and np.isfinite(trace)
         wrong = 0 if known else _not_finite(self._rigid_blocks)
-        here = np.array([wrong, self.cones.count, self.compliance.max(initial=0.0) > 0.0, self.r.size, trace])
+        unanswered = np.count_nonzero(~(_diagonals(self._rigid_blocks) + self.compliance).any(axis=1))
+        soft = self.compliance.max(initial=0.0) > 0.0
+        here = np.array([wrong, self.cones.count, soft, self.r.size, unanswered, trace])
         *counts, trace = self.sum(here).tolist()
-        wrong, self.size, soft, rows = map(int, counts)
+        wrong, self.size, soft, rows, self.unanswered = map(int, counts)
         if wrong:
             self.destroy()
             raise ValueError(f"G has a NaN or an infinite number in {wrong} contacts")

@@ -174,3 +174,49 @@ def test_one_squeezed_sphere_among_many_contacts_on_several_ranks():
     nothing = problem.natural_residual(np.full_like(problem.r, np.nan if comm.rank == 0 else 1.0), problem.r)
     assert words == ["unbounded", "unbounded"]
     assert nothing == np.inf
+
+
+@pytest.mark.parametrize("law", ccp.LAWS)
+@pytest.mark.parametrize("solver", ["pdip", "conic", "auto", "apgd", "kucera"])
+def test_a_contact_that_no_impulse_moves(solver, law):
+    """N has zeros in its rows: it must not close. With the relaxation it must not slide either; a small block of N is
+    no zero."""
+    rng = np.random.default_rng(0)
+    B = rng.normal(size=(15, 20))
+    r, limits = rng.normal(size=(5, 3)), Limits(1e-8)
+
+    def solved(small, fixed):
+        B[6:9] = small * rng.normal(size=(3, 20))
+        r[2] = fixed
+        return ccp.solve(ccp.ConeProblem(SELF, r, np.full(5, 0.4), N=B @ B.T), None, solver, limits, law=law)
+
+    closes = solved(0.0, [-0.3, 0.1, 0.2])
+    assert closes.status is Status.UNBOUNDED
+    assert "no impulse moves 1 contacts, which close" in closes.reason
+    slides = solved(0.0, [0.1, 0.6, 0.8])
+    if law == ccp.COULOMB:
+        assert slides.final
+        assert slides.status is not Status.UNBOUNDED
+    else:
+        assert slides.status is Status.UNBOUNDED
+    assert solved(0.0, [0.5, 0.6, 0.8]).converged
+    assert solved(1e-4, [-0.3, 0.1, 0.2]).converged
+
+
+@pytest.mark.parametrize("law", ccp.LAWS)
+@pytest.mark.parametrize("solver", ccp.SOLVERS)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_an_indefinite_N_is_a_status(solver, law):
+    for seed, share in ((0, 1e-2), (1, 0.1), (2, 1.0)):
+        rng = np.random.default_rng(seed)
+        A = rng.normal(size=(12, 12))
+        values, V = np.linalg.eigh(A @ A.T)
+        values[:4] = -share * values[-1]
+        N = V @ np.diag(values) @ V.T
+        result = ccp.solve(ccp.ConeProblem(SELF, rng.normal(size=(4, 3)), np.full(4, 0.5), N=N), type=solver, law=law)
+        assert isinstance(result.status, Status)
+        assert np.isfinite(result.impulse).all()
+    N = np.eye(6)
+    N[0, 0] = -1.0
+    result = ccp.solve(ccp.ConeProblem(SELF, -np.ones((2, 3)), np.full(2, 0.5), N=N), type=solver, law=law)
+    assert result.status in (Status.UNBOUNDED, Status.BREAKDOWN), result.reason

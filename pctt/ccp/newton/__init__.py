@@ -238,11 +238,11 @@ class Newton:
 
     def _least(self, left: Array, products: Array, b: Array) -> Array:
         """The coefficients of the combination of ``products`` (k, rows) whose difference from b is orthogonal to all of
-        ``left``; zeros if the sums are no numbers."""
+        ``left``; zeros if the sums are no numbers, or the matrix is not positive."""
         sums = self.problem.sum(np.column_stack([left @ products.T, left @ b]))
-        if not np.isfinite(sums).all():
-            return np.zeros(len(products))
         energies, works = sums[:, :-1], sums[:, -1]
+        if not np.isfinite(sums).all() or (np.diagonal(energies) < 0.0).any():
+            return np.zeros(len(products))
         size = np.sqrt(np.maximum(np.diagonal(energies), TINY))
         # scaled, as solutions shrink from one Newton step to the next; of nearly parallel ones only the sum counts
         return np.linalg.lstsq(energies / np.outer(size, size), works / size, rcond=1e-10)[0] / size
