@@ -8,22 +8,25 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows
 from dem.exchange import refuse
 from pctt.ccp.accuracy import Accuracy, figures, measure
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import Array, tangential
 from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.door import Operator
 from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.registry import MATRIX, NEWTON, SOLVERS, why_no_form, why_refused
-from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Limits, Result, Status
+from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Counts, Limits, Result, Status
 from pctt.ccp.rolling import RollingProblem
 from pctt.ccp.unbounded import why_unanswered, why_unbounded
 from pctt.log import phase
@@ -60,6 +63,7 @@ def solve(
     options: Any = None,
     newton: Newton | None = None,
     law: str = COULOMB,
+    monitor: Callable[[int, float], None] | None = None,
 ) -> Result:
     """Find impulses of Coulomb's law by a method of SOLVERS; with the ``law`` RELAXATION solve the cone problem.
 
@@ -75,7 +79,8 @@ def solve(
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
-    from one problem to the next. A problem without a solution has the status UNBOUNDED.
+    from one problem to the next; ``monitor(iterations, residual)`` is called wherever the residual is known, on every
+    rank. A problem without a solution has the status UNBOUNDED.
     """
     if type not in SOLVERS:
         raise ValueError(f"the solver {type!r}: allowed are {', '.join(SOLVERS)}")
@@ -91,6 +96,8 @@ def solve(
         allowed = ", ".join(name for name, method in SOLVERS.items() if method.needs != MATRIX)
         raise ValueError(f"the solver {type!r} reads rows of N, but N is given by its products; allowed are {allowed}")
     limits = limits or Limits()
+    if monitor is not None or limits.monitor:
+        limits = dataclasses.replace(limits, watch=monitor or partial(_print, problem.comm))
     if not limits.tol > 0.0:
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
     result = asked = _by(type, problem, _start(problem, guess), limits, options, newton, law)
@@ -98,7 +105,8 @@ def solve(
     wrong = asked.status is Status.BREAKDOWN and other == "conic"  # products are no numbers
     hopeless = asked.final or asked.exhausted or wrong
     if limits.fallback and not hopeless:
-        second = _by(other, problem, asked.impulse, dataclasses.replace(limits, max_it=-1), None, newton, law)
+        rest = dataclasses.replace(limits.after(asked.iterations), max_it=-1)
+        second = _by(other, problem, asked.impulse, rest, None, newton, law)
         better = second.final or second.residual < asked.residual
         result = second.after(asked) if better else dataclasses.replace(asked).after(second)
         result.asked, result.reason = asked, f"{type}: {asked.reason}; {other}: {second.reason}"
@@ -162,9 +170,27 @@ def _measure(problem: ConeProblem, result: Result) -> Accuracy:
     """Tell the result what its impulses do to the bodies and the contacts, and how accurate they are."""
     result.momentum = problem.momentum(result.impulse)
     rigid = problem.velocity_of(result.momentum)
-    result.velocity = problem.velocities_by(result.impulse, rigid)
+    y = rigid + problem.compliance * result.impulse + problem.r
+    result.velocity = y if problem.units is None else problem.velocities_by(result.impulse)
+    result.counts = _counts(problem, result.impulse, y, result.law != RELAXATION)
     result.accuracy = figures(problem, result.impulse, rigid)
     return result.accuracy
+
+
+def _counts(problem: ConeProblem, g: Array, y: Array, coulomb: bool) -> Counts:
+    """How many contacts are open, slide and stick: of each two numbers that are complementary, impulses in units of
+    velocities, the larger one decides. Collective."""
+    nc, d, cones = problem.cones.count, problem.diagonal, problem.cones
+    opening = y[:nc, 0] if coulomb else y[:nc, 0] - cones.resisted(y)
+    open_ = d[:nc, 0] * g[:nc, 0] <= opening
+    room = 0.5 * (d[:nc, 1] + d[:nc, 2]) * (problem.mu[:nc] * g[:nc, 0] - tangential(g[:nc]))
+    slides = ~open_ & (room < tangential(y[:nc]))
+    opened, sliding = map(int, problem.sum(np.array([open_.sum(), slides.sum()])))
+    return Counts(opened, sliding, problem.size - opened - sliding)
+
+
+def _print(comm: MPI.Comm, iterations: int, residual: float) -> None:
+    PETSc.Sys.Print(f"{iterations:5d} residual {residual:.6e}", comm=comm)
 
 
 def _start(problem: ConeProblem, guess: Array | None) -> Array:

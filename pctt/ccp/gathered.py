@@ -43,10 +43,12 @@ def solve(
         whole = ConeProblem(MPI.COMM_SELF, *given, N=N, compliance=np.concatenate(soft)[:, :2])
         own = Newton(MPI.COMM_SELF, "body")
         if own.has_few(whole):
-            found = conic.solve(whole, np.concatenate(start), limits, options, own, coulomb=coulomb)
+            found = conic.solve(whole, np.concatenate(start), limits.unwatched, options, own, coulomb=coulomb)
         own.destroy()
         whole.destroy()
     found = comm.bcast(found)
+    for iteration, residual in enumerate(found.history):
+        limits.tell(iteration, residual)
     if found.status is Status.GIVEN_UP:
         found.impulse = guess
     else:

@@ -135,13 +135,12 @@ class ConeProblem:
         np.divide(impulse, given, out=g[:, : self._width], where=given > 0.0)
         return g
 
-    def velocities_by(self, g: Array, rigid: Array) -> Array:
-        """The user's velocities y = N g + r (nc, 3), or (nc, 2) in the plane, by impulses g (nc, 3) in the cones, whose
-        velocities are ``rigid`` without compliance and r."""
-        if self.units is not None:
-            g, rigid = self.units * g, np.zeros_like(g)
-            self._given_operator.add_delassus(g, rigid)
-        return (rigid + self.compliance * g + self._given_r)[:, : self._width]
+    def velocities_by(self, g: Array) -> Array:
+        """The user's velocities y = N g + r (nc, 3), or (nc, 2) in the plane, by impulses g (nc, 3) in the cones."""
+        g = g if self.units is None else self.units * g
+        y = self._given_r + self.compliance * g
+        self._given_operator.add_delassus(g, y)
+        return y[:, : self._width]
 
     # -- the operator ---------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
-from problems import SELF, part
+from problems import SELF, heap, part
 from scipy.sparse.linalg import aslinearoperator, splu
 
 from pctt import ccp
@@ -208,6 +208,89 @@ def test_a_preconditioner_that_reads_entries_is_refused_for_an_operator(type, ki
     PETSc.Options()["ccp_pc_type"] = kind
     with pytest.raises(ValueError, match=f"{kind} reads entries, but N is given by its products; allowed are"):
         ccp.solve(case.problem(N=PRODUCTS["function"](case)), type=type)
+
+
+def check_law(g, y, mu, law):
+    """The conditions of optimality in elliptic cones, or of Coulomb's law, by their definition; g, y (nc, 3)."""
+    inside = np.divide(g[:, 1:], mu, out=np.zeros_like(mu), where=mu > 0)
+    assert (np.abs(g[:, 1:]) * (mu == 0)).max() <= 1e-12
+    assert (np.hypot(*inside.T) - g[:, 0]).max() <= 1e-9
+    resisted = np.hypot(*(mu * y[:, 1:]).T)
+    opening = y[:, 0] + (resisted if law == ccp.COULOMB else 0.0)
+    assert (resisted - opening).max() <= 1e-5
+    assert np.abs(g[:, 0] * opening + (g[:, 1:] * y[:, 1:]).sum(axis=1)).max() <= 1e-6
+
+
+@pytest.mark.parametrize("law", ccp.LAWS)
+@pytest.mark.parametrize("type", SOLVERS)
+def test_friction_per_direction(type, law):
+    """Of any two coefficients, of one that is zero, and of both."""
+    case = Case(5)
+    mu = np.random.default_rng(5).uniform(0.05, 1.0, (CONTACTS, 2))
+    mu[:3] = [0.0, 0.5], [0.7, 0.0], [0.0, 0.0]
+    forms = [{"N": case.N}, {"G": case.G, "masses": case.M}]
+    forms += [{"N": ccp.Operator(case.mult, case.blocks)}] if type in TAKING_PRODUCTS else []
+    for given in forms:
+        with ccp.ConeProblem(SELF, case.r, mu, **given) as problem:
+            result = ccp.solve(problem, type=type, law=law, limits=LIMITS)
+            assert result.converged, result.reason
+            case.velocities(result)
+            check_law(result.impulse, result.velocity, mu, law)
+            again = ccp.measure(problem, result.impulse).natural_residual
+            assert again == pytest.approx(result.accuracy.natural_residual, rel=0.1, abs=1e-12)
+            again = ccp.solve(problem, result.impulse, "apgd", LIMITS, law=law)
+            assert again.iterations <= 30  # it begins at the solution
+
+
+def test_friction_of_bodies_per_direction():
+    known, graph = heap()
+    mu = np.stack([known.mu, 0.3 * known.mu], axis=1)
+    problem = ccp.ConeProblem(SELF, known.r, mu, G=graph.part(SELF))
+    result = ccp.solve(problem, limits=LIMITS)
+    assert result.converged
+    check_law(result.impulse, result.velocity, mu, ccp.COULOMB)
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("law", ccp.LAWS)
+def test_equal_friction_in_both_directions_is_that_of_one(law):
+    case = Case(6, comm=MPI.COMM_WORLD)
+    both = np.stack([case.mu, case.mu], axis=1)[case.own]
+    expected = dense(case, law)
+    for given in ({"N": case.N[case.rows]}, {"N": ccp.Operator(case.mult, case.blocks)}):
+        result = ccp.solve(ccp.ConeProblem(case.comm, case.r[case.own], both, **given), law=law, limits=LIMITS)
+        assert case.velocities(result) == pytest.approx(expected, abs=2e-5)
+
+
+@pytest.mark.parallel(1, 2)
+def test_contacts_of_the_plane():
+    """They are those of space whose second tangent nothing moves."""
+    comm = MPI.COMM_WORLD
+    case = Case(7, comm=comm, width=2)
+    lift = np.kron(np.eye(CONTACTS), np.eye(3, 2))
+    r = (lift @ case.r.ravel()).reshape(-1, 3)
+    forms = {
+        "N": {"N": case.N[case.rows]},
+        "G": {"G": sp.csr_matrix(case.G[case.rows]), "masses": case.M},
+        "products": {"N": ccp.Operator(case.mult, case.blocks)},
+        "Mat": {"N": mat(comm, case.N, case.rows, case.rows)},
+    }
+    for law in ccp.LAWS:
+        with ccp.ConeProblem(SELF, r, case.mu, N=lift @ case.N @ lift.T) as problem:
+            of_space = ccp.solve(problem, type="apgd", law=law, limits=ccp.Limits(1e-10, closing_work=1e-7))
+        for given in forms.values():
+            for type in ("apgd", "conic", "pdip") if comm.size == 1 else ("apgd",):
+                result = ccp.solve(case.problem(**given), type=type, law=law, limits=LIMITS)
+                assert result.converged
+                assert result.impulse.shape == case.r[case.own].shape
+                assert (np.abs(result.impulse[:, 1]) <= case.mu[case.own] * result.impulse[:, 0] + 1e-12).all()
+                assert case.velocities(result) == pytest.approx(of_space.velocity[:, :2], abs=2e-5)
+    problem = case.problem(N=case.N[case.rows], compliance=0.3)
+    y = ccp.solve(problem, limits=LIMITS).velocity
+    g = ccp.solve(problem, limits=LIMITS).impulse
+    every = np.concatenate(comm.allgather(g)).ravel()
+    expected = (case.N @ every).reshape(-1, 2)[case.own] + case.r[case.own] + g * [0.3, 0.0]
+    assert y == pytest.approx(expected)
 
 
 class Count:

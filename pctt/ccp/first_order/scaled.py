@@ -272,6 +272,7 @@ class Progress:
         self._next_look = self.iterations + self.check
         residual = self._residual(x, gradient)
         self.history.append(residual)
+        self.limits.tell(self.iterations, residual)
         if residual < self.best or self._looks == 0:
             self.best, self._point = residual, x.copy()
         self._looks += 1

@@ -118,6 +118,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         y = velocity(problem, g)
         errors = problem.errors(g, y)
         history.append(limits.residual(errors))
+        limits.tell(iteration, history[-1])
         if history[-1] <= limits.tol:
             status, reason = Status.CONVERGED, limits.met
             break
