@@ -200,7 +200,7 @@ class Stepper:
                 wider = in_order(world, wider, dt)
                 return carried(world, contacts, wider) if self._corrections else wider
             if self._corrections < 3 and not world.only_spheres:
-                turned = find_turned(world, contacts, velocity, dt, 0.1 * delta, recovery)
+                turned = find_turned(world, contacts, velocity, dt, 0.1 * delta, recovery, self._corrections)
                 if turned is not None:
                     self._corrections += 1
                     return turned

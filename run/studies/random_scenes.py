@@ -38,6 +38,7 @@ from dem.together import SceneError
 
 G = 9.81
 PITCH = 2.6  # from place to place, in radii: the largest grains reach 1
+CLOSE = 2.2  # the same in a cell of given stress, which closes slowly
 DEEP = 0.1  # an overlap worth a note, in radii of the smallest grain
 MANY = 10_000  # iterations of a step worth a note
 SUDDEN = 10.0  # a speed that ends a run, over the greatest one before, that no impact explains
@@ -112,7 +113,8 @@ def mixture(seed: int) -> Mixture:
     count = np.array([5, 5, 5] if cell else [*draw.rng.integers(2, 4, 2), draw.rng.integers(1, 4)])
     if boundary == "channel":
         count[0] = 6
-    size = PITCH * radius * count
+    pitch = CLOSE if boundary == "stress" else PITCH
+    size = pitch * radius * count
     laws, more = laws_of(draw, radius), {}
     if boundary == "stress":
         laws.pop("stiffness", None)
@@ -130,7 +132,7 @@ def mixture(seed: int) -> Mixture:
     made.rigid = "restitution" in laws or "stiffness" in laws
     made.fed += [boundary] * (boundary in ("sheared", "stress"))
     density = 10.0 ** draw.rng.uniform(2.0, 4.0)
-    places = add_grains(draw, made, count, density, more)
+    places = add_grains(draw, made, count, pitch, density, more)
     walls(draw, made, boundary, size)
     if boundary in ("walls", "mesh", "boxes") and draw.chance(0.5):
         add_tool(draw, made, size, density, rocks="rocks" in made.features, mesh=boundary == "mesh")
@@ -163,7 +165,7 @@ def laws_of(draw: Draw, radius: float) -> dict[str, float]:
     return laws
 
 
-def add_grains(draw: Draw, made: Mixture, count: np.ndarray, density: float, more: Row) -> np.ndarray:
+def add_grains(draw: Draw, made: Mixture, count: np.ndarray, pitch: float, density: float, more: Row) -> np.ndarray:
     """Grains of some shapes near the places of a lattice; their centres (n, 3) in the order of their ids."""
     radius, kinds = made.radius, ["spheres", "boxes", "capsules", "clumps", "rocks"]
     if made.features[0] == "mesh":
@@ -172,7 +174,7 @@ def add_grains(draw: Draw, made: Mixture, count: np.ndarray, density: float, mor
     if {"rocks", "capsules"} <= set(chosen):
         chosen.remove(draw.one("rocks", "capsules"))
     grid = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
-    places = PITCH * radius * grid + draw.rng.uniform(-0.1, 0.1, grid.shape) * radius
+    places = pitch * radius * grid + draw.rng.uniform(-0.1, 0.1, grid.shape) * radius
     speed, spin = draw.one(0.0, 1.0, 3.0), draw.one(0.0, 1.0, 3.0)
     velocity = draw.rng.normal(size=places.shape) * np.sqrt(G * radius) * speed
     turning = draw.rng.normal(size=places.shape) * np.sqrt(G / radius) * spin
