@@ -307,6 +307,23 @@ def test_contacts_of_the_plane():
     assert y == pytest.approx(expected)
 
 
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("width", [2, 3])
+def test_the_same_matrix_with_other_velocities(width):
+    case = Case(8, comm=MPI.COMM_WORLD, width=width)
+    first = case.problem(G=case.G[case.rows], masses=case.M)
+    before = ccp.solve(first, type="pdip", limits=LIMITS).impulse
+    other = first.with_velocities(0.5 * case.r[case.own])
+    after = ccp.solve(other, type="pdip", limits=LIMITS)
+    assert other.operator is first.operator
+    assert 2.0 * case.mult(after.impulse) == pytest.approx(case.mult(before), abs=1e-4)
+    assert after.velocity == pytest.approx(case.mult(after.impulse) + 0.5 * case.r[case.own])
+    assert ccp.solve(first, type="pdip", limits=LIMITS).impulse == pytest.approx(before)
+    for wrong in (case.r[case.own][1:], np.full_like(case.r[case.own], np.nan), np.zeros((5, 4))):
+        with pytest.raises(ValueError, match="^r "):
+            first.with_velocities(wrong)
+
+
 class Count:
     """An object of one's own with the members of an `Operator`."""
 
