@@ -350,14 +350,12 @@ def _by_solves(comm: MPI.Comm, G: sp.csr_matrix, solve: Solve, together: bool) -
         high = min(low + BATCH, end)
         own = slice(max(low, first), max(min(high, last), max(low, first)))
         X = solve(whole[low:high].T.toarray())[:, own.start - low : own.stop - low]  # (n, rows)
-        if not on_any(comm, not np.isfinite(X).all())[0]:
-            near = np.asarray(whole[own] @ X).reshape(-1, 3, X.shape[1] or 1)
-            for k in range((own.stop - own.start) // 3):
-                blocks[(own.start - first) // 3 + k] = near[k, :, 3 * k : 3 * k + 3]
-        else:
+        if on_any(comm, not np.isfinite(X).all())[0]:
             raise ValueError("masses: a solve returns a NaN or an infinite number")
+        k = np.arange((own.stop - own.start) // 3)
+        blocks[(own.start - first) // 3 + k] = (whole[own] @ X).reshape(len(k), 3, len(k), 3)[k, :, k, :]
         if count <= MOST:
-            kept.append(sp.csr_matrix(np.asarray(whole @ X).T))
+            kept.append(sp.csr_matrix((whole @ X).T))
             count += comm.allreduce(int(kept[-1].nnz))
     if count <= MOST:
         rows = sp.vstack([sp.csr_matrix((0, whole.shape[0])), *kept], format="csr")

@@ -171,14 +171,17 @@ def test_all_forms_on_any_ranks():
 
 
 @pytest.mark.parallel(1, 2)
-def test_a_map_whose_N_would_not_fit_is_an_operator(monkeypatch):
-    monkeypatch.setattr(door, "MOST", 100)
+@pytest.mark.parametrize("most", [100, 10_000])
+def test_a_map_whose_N_would_not_fit_is_an_operator(monkeypatch, most):
+    monkeypatch.setattr(door, "MOST", most)
+    monkeypatch.setattr(door, "BATCH", 6)
     case = Case(3, comm=MPI.COMM_WORLD)
+    g = np.random.default_rng(0).normal(size=case.r.shape)[case.own]
     for masses in ("csr", "KSP"):
         problem = case.problem(G=case.G[case.rows], masses=MASSES[masses](case))
-        assert not problem.has_entries
+        assert problem.has_entries == (most > 100)
         assert problem.diagonal_blocks == pytest.approx(case.blocks)
-        same(case, {"G": case.G[case.rows], "masses": MASSES[masses](case)})
+        assert problem.product(g) == pytest.approx(case.mult(g))
 
 
 def test_masses_of_joints_keep_N_sparse_and_infinite_ones_do_not_move():
