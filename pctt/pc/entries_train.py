@@ -93,14 +93,12 @@ class EntriesTrain:
         self._named = f"-{prefix}pc_tt_"  # how the names of the options begin
         self._places = places
         self._layout: Layout | None = None
-        self.rank = options.max_rank or 100 if options.automatic else int(options.rank)
+        self.rank = options.max_rank if options.automatic else int(options.rank)
         self.transform: DifferencesInverse | None = None
         self.compressed: GridTrain | None = None
         self.inverse: Inverse | None = None
         self.symmetric = True
         self.failure = self.note = ""
-        self._refused = ""  # why there was no train of an earlier matrix; it is not tried again
-        self._distrusted = ""  # why nothing but the diagonal is used any more
 
     def make(self, A: PETSc.Mat, P: PETSc.Mat) -> bool:
         """Make a preconditioner. False: the diagonal is better, or nothing else worked; `failure` or `note` say why.
@@ -114,8 +112,8 @@ class EntriesTrain:
         the diagonal, and 1 takes over if it fails. ValueError on all ranks for bad entries or a bad
         grid.
         """
-        self.failure, self.note, self.transform = self._distrusted, "", None
-        if self.rank == 1 or self._distrusted:
+        self.failure, self.note, self.transform = "", "", None
+        if self.rank == 1:
             return False
         options, iterations = self.options, 50  # if there is no estimate
         layout = self._layout = self._layout or layout_of(P, options.order, f"{self._named}order", self._places)
@@ -133,9 +131,9 @@ class EntriesTrain:
             if self.transform is None:
                 self.note = f"conjugate gradients take about {iterations} iterations, so a train does not pay"
             return self._take_no_train(P, layout, "")
-        self._refused = self._refused or self._make_train(P, layout, options.setup_limit or limit)
-        if self._refused:
-            return self._take_no_train(P, layout, self._refused)
+        refused = self._make_train(P, layout, options.setup_limit or limit)
+        if refused:
+            return self._take_no_train(P, layout, refused)
         self.transform = None
         return True
 
@@ -152,45 +150,65 @@ class EntriesTrain:
         return self.transform is not None
 
     def _make_train(self, P: PETSc.Mat, layout: Layout, limit: float) -> str:
-        """Make a train with at most this number of operations; the reason if there is no positive one.
+        """Make a train of at most the rank that is asked for; the reason if there is no positive one.
 
-        eps is lowered three times if the train of the matrix or of its inverse is not positive.
+        If the limit of operations ends an attempt that has come to nothing, one with a fourth of the rank follows, to
+        which trains near the limit would be no better.
+        """
+        first, cap = "", self.rank
+        if self.options.reuse == "none":
+            self.compressed = None
+        while True:
+            why, stopped = self._try_train(P, layout, limit, cap)
+            if not why:
+                return ""
+            first, cap = first or why, cap // 4
+            if not stopped or cap < 5:
+                return first
+
+    def _try_train(self, P: PETSc.Mat, layout: Layout, limit: float, cap: int) -> tuple[str, bool]:
+        """Make a train of at most this rank with at most this number of operations.
+
+        eps is lowered three times if the train of the matrix or of its inverse is not positive. The result says why
+        there is no positive train, and whether the limit is to blame; ("", False) if there is one.
         """
         work, eps = Work(limit), self.options.eps
         try:
             for _ in range(4):
-                warm = self.compressed is not None and self.options.reuse != "none"
+                warm = self.compressed is not None
                 with PETSc.Log.Event("TTCompress"):
-                    A = self.compressed = self._compress(P, layout, eps, self.compressed if warm else None, work)
+                    A = self.compressed = self._compress(P, layout, eps, cap, self.compressed, work)
                 self.symmetric = A.symmetric
                 if A.shift <= 0:
-                    return "the mean of the diagonal is not positive"
+                    return "the mean of the diagonal is not positive", False
                 self.account.reused += warm
                 with PETSc.Log.Event("TTInvert"):
-                    X = self.inverse = self._invert(A, eps, work)
+                    X = self.inverse = self._invert(A, cap, eps, work)
                     if X is not None:
                         self._product = A.product(X.applied)
                         if X.certain or not self._is_negative(P):
-                            return ""
+                            return "", False
+                        if X.stopped:
+                            return self._too_much(X.stopped, work), True
                         if X.residual > eps:
                             break  # the rank cannot reach this accuracy, and even less a higher one
                 eps *= 0.05
-            return self._why_not_positive(A, X)
+            return self._why_not_positive(A, X, cap), False
         except TooMuchWorkError as stopped:
-            return self._too_much(str(stopped), work)
+            return self._too_much(str(stopped), work), True
 
     def _compress(
-        self, P: PETSc.Mat, layout: Layout, eps: float, start: GridTrain | None, work: Work
+        self, P: PETSc.Mat, layout: Layout, eps: float, cap: int, start: GridTrain | None, work: Work
     ) -> GridTrain:
         known = compressed(P)
         if known is not None and known.error <= eps and self.options.order in ("auto", known.layout.order):
-            return known.rounded(0.5 * eps, self.rank)
-        return compressed_entries(P, layout, eps, self.rank, start, work)
+            return known.rounded(0.5 * eps, cap)
+        return compressed_entries(P, layout, eps, cap, start, work)
 
-    def _invert(self, A: GridTrain, eps: float, work: Work) -> Inverse | None:
+    def _invert(self, A: GridTrain, cap: int, eps: float, work: Work) -> Inverse | None:
         """The inverse of A / c; None if its train turns out not to be positive."""
         found, work.spent = on_first(
-            self.comm, lambda: (invert_positive(A.train, self.rank, eps, work=work), work.spent)
+            self.comm, lambda: (invert_positive(A.train, cap, eps, work=work), work.spent)
         )
         return found
 
@@ -217,20 +235,20 @@ class EntriesTrain:
             return f"{limit}: the ranks of the matrix grow, which is hopeless in this order of the points"
         return f"{limit}: a train costs more than one solution without it; raise the limit for many right-hand sides"
 
-    def _why_not_positive(self, A: GridTrain, X: Inverse | None) -> str:
+    def _why_not_positive(self, A: GridTrain, X: Inverse | None, cap: int) -> str:
         missed = f"the train of the matrix leaves {A.error:.1e} of it"
         if X is None:
             return f"the train of the matrix is not positive, {missed}: lower {self._named}eps"
         if X.residual <= self.options.eps:
             return f"the inverse is not positive, because {missed}: lower {self._named}eps"
-        why = f"the inverse of rank {self.rank} is not positive, it leaves {X.residual:.1e} of the residual"
+        why = f"the inverse of rank {cap} is not positive, it leaves {X.residual:.1e} of the residual"
         return f"{why}: " + (f"raise {self._named}rank" if X.residual < 1 else "this is hopeless")
 
     # -- application ----------------------------------------------------------------------------------------
 
     def distrust(self, why: str) -> None:
-        """A solve failed: the diagonal is used from now on."""
-        self._distrusted = why
+        """A solve failed; the next matrix is tried again."""
+        self.failure = why
 
     def use(self, dtype: DTypeLike) -> None:
         """Multiply with the train in this precision; a transform has double precision."""
@@ -254,6 +272,13 @@ class EntriesTrain:
         """What is used where no train is."""
         return "block Jacobi" if self.transform is None else f"the {self.transform.transform.name}"
 
+    @property
+    def left(self) -> float:
+        """What the trains leave of the matrix or of the residual, the larger part; 0 without trains."""
+        if self.compressed is None or self.inverse is None:
+            return 0.0
+        return max(self.compressed.error, self.inverse.residual)
+
     def words(self) -> str:
         """What the preconditioner really is, with ranks, errors and sizes."""
         if self.transform is not None:
@@ -263,7 +288,9 @@ class EntriesTrain:
         assert self.compressed is not None
         assert self.inverse is not None
         X = self.inverse.applied
-        return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}"
+        stopped = self.inverse.stopped
+        stopped = stopped and f"; the limit of operations ({self._named}setup_limit) ended {stopped}"
+        return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}{stopped}"
 
 
 def _product_operations(P: PETSc.Mat, layout: Layout) -> float:
