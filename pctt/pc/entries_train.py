@@ -21,6 +21,7 @@ from pctt.mat.grid_train import GridTrain, TrainProduct, WholeVectors
 from pctt.mat.order import Layout, Places, layout_of
 from pctt.mat.tensor_train import compressed, compressed_entries
 from pctt.pc.mat import finds_negative, iterations_with_the_diagonal
+from pctt.pc.nystrom import Identity, Nystrom, choose
 from pctt.pc.options import Account, Options
 from pctt.tt import differences
 from pctt.tt.cross import CROSS
@@ -94,7 +95,7 @@ class EntriesTrain:
         self._places = places
         self._layout: Layout | None = None
         self.rank = options.max_rank if options.automatic else int(options.rank)
-        self.transform: DifferencesInverse | None = None
+        self.transform: DifferencesInverse | Nystrom | Identity | None = None
         self.compressed: GridTrain | None = None
         self.inverse: Inverse | None = None
         self.symmetric = True
@@ -103,7 +104,8 @@ class EntriesTrain:
     def make(self, A: PETSc.Mat, P: PETSc.Mat) -> bool:
         """Make a preconditioner. False: the diagonal is better, or nothing else worked; `failure` or `note` say why.
 
-        1. If entries depend on differences, CG with a fast transform would do; otherwise CG with the diagonal.
+        1. If entries depend on differences, CG with a fast transform would do; otherwise CG with the best of the
+           diagonal, Nystrom's approximation and nothing (`pctt.pc.nystrom.choose`).
         2. A train may take a quarter of the operations of this solution, unless -pc_tt_setup_limit is given. If the
            quarter is less than `pays`, no train is tried.
         3. If there is no train within the limit, or if it is not positive, 1 takes over.
@@ -112,33 +114,44 @@ class EntriesTrain:
         the diagonal, and 1 takes over if it fails. ValueError on all ranks for bad entries or a bad
         grid.
         """
-        self.failure, self.note, self.transform = "", "", None
+        self.failure, self.note, self.transform, self._iterations = "", "", None, 50  # if there is no estimate
         if self.rank == 1:
             return False
-        options, iterations = self.options, 50  # if there is no estimate
+        options = self.options
         layout = self._layout = self._layout or layout_of(P, options.order, f"{self._named}order", self._places)
-        product = _product_operations(P, layout)
         if options.automatic and options.eps >= options.coarse:
-            self.transform = DifferencesInverse.of(P, layout)
-        if self.transform is not None:  # an iteration with it takes 1.3 products
-            limit = options.part * 1.3 * product * self.transform.iterations
+            limit = options.part * self._choose_base(A, P, layout)
         else:
+            product = _product_operations(P, layout, by_fft=True)
             if multiplies(A) and (options.automatic or 20 * product < options.pays):  # six products are cheap
-                iterations = iterations_with_the_diagonal(A, diagonal(P))
-            cost = iterations * product
+                self._iterations = iterations_with_the_diagonal(A, diagonal(P))
+            cost = self._iterations * product
             limit = options.part * cost if options.automatic else options.pays + cost
         if options.automatic and limit < options.pays:
             if self.transform is None:
-                self.note = f"conjugate gradients take about {iterations} iterations, so a train does not pay"
-            return self._take_no_train(P, layout, "")
+                self.note = f"conjugate gradients take about {self._iterations} iterations, so a train does not pay"
+            return self._take_no_train(A, P, layout, "")
         refused = self._make_train(P, layout, options.setup_limit or limit)
         if refused:
-            return self._take_no_train(P, layout, refused)
+            return self._take_no_train(A, P, layout, refused)
         self.transform = None
         return True
 
-    def _take_no_train(self, P: PETSc.Mat, layout: Layout, why: str) -> bool:
-        """Use the transform if there is one; False: there is none. ``why``: a train that was tried has failed."""
+    def _choose_base(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout) -> float:
+        """Choose what is used where no train is; the operations of a solution with it."""
+        self.transform = DifferencesInverse.of(P, layout)
+        product = _product_operations(P, layout, by_fft=self.transform is not None)
+        if isinstance(self.transform, DifferencesInverse):  # an iteration with it takes 1.3 products
+            return 1.3 * product * self.transform.iterations
+        if not multiplies(A) or not is_symmetric(Entries.of(P), P.getSize()[0]):
+            return self._iterations * product
+        found = choose(P, A, product)
+        self.transform = found.inverse or (None if found.scaled else Identity())
+        self._iterations = int(min(found.iterations, 1e9))
+        return found.cost * product
+
+    def _take_no_train(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout, why: str) -> bool:
+        """Use the base if it is not the diagonal; False: it is. ``why``: a train that was tried has failed."""
         self.compressed = self.inverse = None
         if self.transform is not None:
             self.note = why
@@ -146,7 +159,7 @@ class EntriesTrain:
             self.account.fall_back(why)
             self.failure = why
             if not self.options.automatic:
-                self.transform = DifferencesInverse.of(P, layout)
+                self._choose_base(A, P, layout)
         return self.transform is not None
 
     def _make_train(self, P: PETSc.Mat, layout: Layout, limit: float) -> str:
@@ -270,7 +283,9 @@ class EntriesTrain:
     @property
     def base(self) -> str:
         """What is used where no train is."""
-        return "block Jacobi" if self.transform is None else f"the {self.transform.transform.name}"
+        if isinstance(self.transform, DifferencesInverse):
+            return f"the {self.transform.transform.name}"
+        return "block Jacobi" if self.transform is None else self.transform.words
 
     @property
     def left(self) -> float:
@@ -283,6 +298,8 @@ class EntriesTrain:
         """What the preconditioner really is, with ranks, errors and sizes."""
         if self.transform is not None:
             reason = f", because {self.note}" if self.note else ""
+            if not isinstance(self.transform, DifferencesInverse):
+                return f"{self.base}, no train{reason}"
             grid = " x ".join(map(str, self.transform.transform.shape))
             return f"no train but {self.base} of a grid of {grid}{reason}"
         assert self.compressed is not None
@@ -293,12 +310,15 @@ class EntriesTrain:
         return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}{stopped}"
 
 
-def _product_operations(P: PETSc.Mat, layout: Layout) -> float:
-    """Of a product with P, by FFT on a grid twice as wide if P does not show how it multiplies."""
+def _product_operations(P: PETSc.Mat, layout: Layout, by_fft: bool) -> float:
+    """Of a product with P. If P does not show how it multiplies: by FFT on a grid twice as wide, or else as a stored
+    matrix, or in a microsecond per row, as fast multipole methods and H-matrices take."""
     known = compressed(P)
     if known is not None:
         return apply_operations(known.train)
     if P.getType() in DENSE:
         return 0.5 * float(P.getSize()[0]) ** 2
+    if not by_fft:
+        return min(0.5 * float(P.getSize()[0]) ** 2, 1e3 * P.getSize()[0])
     wide = prod(2 * n for n in layout.digits.shape)
     return wide * log2(wide)

@@ -139,7 +139,7 @@ def test_a_refusal_holds_for_its_values():
             ksp = ksp or solver(mat, rank=8)
             ksp.setOperators(mat)
             ksp.setUp()
-        assert (context(ksp).rank == 1) == refused
+        assert bool(made(ksp).failure) == refused
         assert any("takes over" in str(one.message) for one in heard) == (refused and MPI.COMM_WORLD.rank == 0)
         if not refused:
             its, _ = solve(ksp)

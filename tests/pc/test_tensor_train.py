@@ -184,8 +184,8 @@ def test_a_train_that_leaves_more_than_half_is_said_to():
     links = links + links.T
     graph = (sp.diags(np.asarray(links.sum(axis=1)).ravel() + 6.0) - links).tocsr()
     mat = PETSc.Mat().createAIJ(graph.shape, csr=(graph.indptr, graph.indices, graph.data))
+    ksp = solver(mat, rank=4, order="natural")
     with pytest.warns(UserWarning, match="leaves 0.[5-9]"):
-        ksp = solver(mat, rank=4, order="natural")
         ksp.setUp()
     assert context(ksp).rank == 4
     with warnings.catch_warnings():
