@@ -1,7 +1,7 @@
 """A preconditioner of a matrix on a grid that is given by its entries: a fast transform, or the train of an inverse.
 
-Where the entries depend on differences of points only, a cosine or sine transform (`pctt.tt.differences`) costs next to
-nothing. Otherwise cross approximation compresses the matrix, which is not scaled, and its inverse is computed.
+Where the entries depend on differences of points only, a fast transform (`pctt.pc.transforms`) costs next to nothing.
+Otherwise cross approximation compresses the matrix, which is not scaled, and its inverse is computed.
 `EntriesTrain.make` is the rule of -pc_tt_rank auto, in operations (about a nanosecond each, `pctt.tt.work`).
 """
 
@@ -9,77 +9,31 @@ from __future__ import annotations
 
 from math import log2, prod
 
-import numpy as np
 from mpi4py import MPI
 from numpy.typing import DTypeLike
 from petsc4py import PETSc
 
 from dem.exchange import on_first
 from pctt.blocks import symmetric_shell
-from pctt.mat.entries import DENSE, Entries, diagonal, is_symmetric, multiplies
-from pctt.mat.grid_train import GridTrain, TrainProduct, WholeVectors
+from pctt.mat.entries import DENSE, diagonal, multiplies
+from pctt.mat.grid_train import GridTrain, TrainProduct
 from pctt.mat.order import Layout, Places, layout_of
 from pctt.mat.tensor_train import compressed, compressed_entries
 from pctt.pc.mat import finds_negative, iterations_with_the_diagonal
 from pctt.pc.options import Account, Options
-from pctt.tt import differences
+from pctt.pc.transforms import DifferencesInverse, Identity
+from pctt.tt.conjugate import Promise
 from pctt.tt.cross import CROSS
 from pctt.tt.inverse import Inverse, invert_positive
 from pctt.tt.train import Array
 from pctt.tt.work import TooMuchWorkError, Work, apply_operations
 
 
-class DifferencesInverse:
-    """The inverse of the fast transform that is nearest to a matrix whose entries depend on differences.
-
-    transform : see `pctt.tt.differences.FastTransform`
-    iterations : those of conjugate gradients on a part of the grid, to 1e-8
-    """
-
-    def __init__(self, layout: Layout, transform: differences.FastTransform, iterations: int) -> None:
-        self.gather, self.order = WholeVectors(layout.comm, layout.counts), layout.rows
-        self.transform, self.iterations = transform, iterations
-
-    @classmethod
-    def of(cls, P: PETSc.Mat, layout: Layout) -> DifferencesInverse | None:
-        """For a Mat with entries; None if they do not depend on differences, or are not symmetric and positive.
-
-        Collective; ValueError on all ranks.
-        """
-        if P.getBlockSize() > 1:
-            return None
-        entries, shape, comm = Entries.of(P), layout.digits.shape, layout.comm
-        even = differences.depend_on_differences(entries, shape, layout.rows, np.random.default_rng(0))
-        if even is None or not is_symmetric(entries, layout.digits.rows):
-            return None
-        means = differences.means_of_differences(entries, shape, layout.rows, even)
-        # what other ranks find best may differ by rounding
-        found = on_first(comm, lambda: differences.best(means))
-        if found is None:
-            return None
-        transform = differences.FastTransform(means, found[0])
-        return cls(layout, transform, found[1]) if comm.bcast(transform.positive) else None
-
-    def __call__(self, x: Array) -> Array:
-        """This rank's part of the product, from its part of x. Every rank transforms the whole vector."""
-        x = self.gather(x)
-        if self.order is None:
-            return self.transform.solve(x)[self.gather.mine]
-        out = np.empty_like(x)
-        out[self.order] = self.transform.solve(x[self.order])
-        return out[self.gather.mine]
-
-    @property
-    def flops(self) -> int:
-        """Operations of this rank in a product: two transforms."""
-        rows = prod(self.transform.shape)
-        return int(5 * rows * log2(max(2, rows)))
-
-
 class EntriesTrain:
     """`make` makes a preconditioner for a matrix, `times` multiplies with it.
 
-    transform : the fast transform that is used; None if it is a train, or nothing
+    transform : the fast transform that is used; None if it is a train, or the diagonal
+    promise : what a trial has shown of the preconditioner in use, for `pctt.pc.watch`; None: it is not watched
     compressed, inverse : trains of the present matrix and of its inverse; None before `make`, and without a train
     rank : cap of the ranks
     failure : why a train that was wanted is not used; empty if all is as asked
@@ -94,7 +48,8 @@ class EntriesTrain:
         self._places = places
         self._layout: Layout | None = None
         self.rank = options.max_rank or 100 if options.automatic else int(options.rank)
-        self.transform: DifferencesInverse | None = None
+        self.transform: DifferencesInverse | Identity | None = None
+        self.promise: Promise | None = None
         self.compressed: GridTrain | None = None
         self.inverse: Inverse | None = None
         self.symmetric = True
@@ -114,16 +69,17 @@ class EntriesTrain:
         the diagonal, and 1 takes over if it fails. ValueError on all ranks for bad entries or a bad
         grid.
         """
-        self.failure, self.note, self.transform = self._distrusted, "", None
+        self.failure, self.note, self.transform, self.promise = self._distrusted, "", None, None
         if self.rank == 1 or self._distrusted:
             return False
-        options, iterations = self.options, 50  # if there is no estimate
+        options, iterations, found = self.options, 50, None  # 50 if there is no estimate
         layout = self._layout = self._layout or layout_of(P, options.order, f"{self._named}order", self._places)
         product = _product_operations(P, layout)
         if options.automatic and options.eps >= options.coarse:
-            self.transform = DifferencesInverse.of(P, layout)
-        if self.transform is not None:  # an iteration with it takes 1.3 products
-            limit = options.part * 1.3 * product * self.transform.iterations
+            self.transform = found = DifferencesInverse.best_of(P, layout)
+        if found is not None:
+            promise = self.promise = found.promise
+            limit = options.part * (1 + promise.each) * product * promise.iterations
         else:
             if multiplies(A) and (options.automatic or 20 * product < options.pays):  # six products are cheap
                 iterations = iterations_with_the_diagonal(A, diagonal(P))
@@ -148,7 +104,7 @@ class EntriesTrain:
             self.account.fall_back(why)
             self.failure = why
             if not self.options.automatic:
-                self.transform = DifferencesInverse.of(P, layout)
+                self.transform = DifferencesInverse.best_of(P, layout)
         return self.transform is not None
 
     def _make_train(self, P: PETSc.Mat, layout: Layout, limit: float) -> str:
@@ -232,6 +188,12 @@ class EntriesTrain:
         """A solve failed: the diagonal is used from now on."""
         self._distrusted = why
 
+    def leave(self, why: str) -> None:
+        """Conjugate gradients are faster without a preconditioner: there is none from now on."""
+        self.account.fall_back(why)
+        self.note, self.promise = why, None
+        self.transform, self.compressed, self.inverse = Identity(), None, None
+
     def use(self, dtype: DTypeLike) -> None:
         """Multiply with the train in this precision; a transform has double precision."""
         if self.transform is None:
@@ -252,14 +214,13 @@ class EntriesTrain:
     @property
     def base(self) -> str:
         """What is used where no train is."""
-        return "block Jacobi" if self.transform is None else f"the {self.transform.transform.name}"
+        return "block Jacobi" if self.transform is None else self.transform.name
 
     def words(self) -> str:
         """What the preconditioner really is, with ranks, errors and sizes."""
         if self.transform is not None:
             reason = f", because {self.note}" if self.note else ""
-            grid = " x ".join(map(str, self.transform.transform.shape))
-            return f"no train but {self.base} of a grid of {grid}{reason}"
+            return f"{self.transform.words}, no train{reason}"
         assert self.compressed is not None
         assert self.inverse is not None
         X = self.inverse.applied

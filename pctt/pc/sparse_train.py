@@ -43,7 +43,7 @@ class SparseTrain:
     failure : why a train that was asked for is not used; it is not tried again before the next structure
     """
 
-    note, base = "", "block Jacobi"
+    note, base, promise = "", "block Jacobi", None
     single_pays = False
     _product: TrainProduct  # of the inverse in use
 
