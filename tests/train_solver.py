@@ -70,7 +70,7 @@ def dense_mat(A: np.ndarray, comm: Any = PETSc.COMM_WORLD, **attributes: object)
     return with_attributes(mat, **attributes)
 
 
-def shell(entries: Any, A: np.ndarray, **attributes: object) -> PETSc.Mat:
+def shell(entries: Any, A: np.ndarray, block: int = 1, **attributes: object) -> PETSc.Mat:
     """A Mat that a user has written, with dense products by A, and with this function of its entries."""
 
     class Shell:
@@ -78,7 +78,10 @@ def shell(entries: Any, A: np.ndarray, **attributes: object) -> PETSc.Mat:
             y.array_w[:] = A[slice(*y.getOwnershipRange())] @ gathered(x)
 
     sizes = (PETSc.DECIDE, len(A))
-    mat = PETSc.Mat().createPython((sizes, sizes), Shell(), comm=PETSc.COMM_WORLD)
+    mat = PETSc.Mat().create(PETSc.COMM_WORLD)
+    mat.setSizes((sizes, sizes), block)
+    mat.setType(PETSc.Mat.Type.PYTHON)
+    mat.setPythonContext(Shell())
     mat.setUp()
     return with_attributes(mat, entries=entries, **attributes)
 

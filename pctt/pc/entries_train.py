@@ -1,7 +1,7 @@
 """A preconditioner of a matrix on a grid that is given by its entries: a fast transform, or the train of an inverse.
 
-Where the entries depend on differences of points only, a cosine or sine transform (`pctt.tt.differences`) costs next to
-nothing. Otherwise cross approximation compresses the matrix, which is not scaled, and its inverse is computed.
+Where the entries depend on differences of points only, a fast transform (`pctt.pc.transforms`) costs next to nothing.
+Otherwise cross approximation compresses the matrix, which is not scaled, and its inverse is computed.
 `EntriesTrain.make` is the rule of -pc_tt_rank auto, in operations (about a nanosecond each, `pctt.tt.work`).
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from math import log2, prod
 
-import numpy as np
 from mpi4py import MPI
 from numpy.typing import DTypeLike
 from petsc4py import PETSc
@@ -17,70 +16,25 @@ from petsc4py import PETSc
 from dem.exchange import on_first
 from pctt.blocks import symmetric_shell
 from pctt.mat.entries import DENSE, Entries, diagonal, is_symmetric, multiplies
-from pctt.mat.grid_train import GridTrain, TrainProduct, WholeVectors
+from pctt.mat.grid_train import GridTrain, TrainProduct
 from pctt.mat.order import Layout, Places, layout_of
 from pctt.mat.tensor_train import compressed, compressed_entries
 from pctt.pc.mat import finds_negative, iterations_with_the_diagonal
-from pctt.pc.nystrom import Identity, Nystrom, choose
+from pctt.pc.nystrom import Nystrom, choose
 from pctt.pc.options import Account, Options
-from pctt.tt import differences
+from pctt.pc.transforms import DifferencesInverse, Identity
+from pctt.tt.conjugate import Promise
 from pctt.tt.cross import CROSS
 from pctt.tt.inverse import Inverse, invert_positive
 from pctt.tt.train import Array
 from pctt.tt.work import TooMuchWorkError, Work, apply_operations
 
 
-class DifferencesInverse:
-    """The inverse of the fast transform that is nearest to a matrix whose entries depend on differences.
-
-    transform : see `pctt.tt.differences.FastTransform`
-    iterations : those of conjugate gradients on a part of the grid, to 1e-8
-    """
-
-    def __init__(self, layout: Layout, transform: differences.FastTransform, iterations: int) -> None:
-        self.gather, self.order = WholeVectors(layout.comm, layout.counts), layout.rows
-        self.transform, self.iterations = transform, iterations
-
-    @classmethod
-    def of(cls, P: PETSc.Mat, layout: Layout) -> DifferencesInverse | None:
-        """For a Mat with entries; None if they do not depend on differences, or are not symmetric and positive.
-
-        Collective; ValueError on all ranks.
-        """
-        if P.getBlockSize() > 1:
-            return None
-        entries, shape, comm = Entries.of(P), layout.digits.shape, layout.comm
-        even = differences.depend_on_differences(entries, shape, layout.rows, np.random.default_rng(0))
-        if even is None or not is_symmetric(entries, layout.digits.rows):
-            return None
-        means = differences.means_of_differences(entries, shape, layout.rows, even)
-        # what other ranks find best may differ by rounding
-        found = on_first(comm, lambda: differences.best(means))
-        if found is None:
-            return None
-        transform = differences.FastTransform(means, found[0])
-        return cls(layout, transform, found[1]) if comm.bcast(transform.positive) else None
-
-    def __call__(self, x: Array) -> Array:
-        """This rank's part of the product, from its part of x. Every rank transforms the whole vector."""
-        x = self.gather(x)
-        if self.order is None:
-            return self.transform.solve(x)[self.gather.mine]
-        out = np.empty_like(x)
-        out[self.order] = self.transform.solve(x[self.order])
-        return out[self.gather.mine]
-
-    @property
-    def flops(self) -> int:
-        """Operations of this rank in a product: two transforms."""
-        rows = prod(self.transform.shape)
-        return int(5 * rows * log2(max(2, rows)))
-
-
 class EntriesTrain:
     """`make` makes a preconditioner for a matrix, `times` multiplies with it.
 
-    transform : the fast transform that is used; None if it is a train, or nothing
+    transform : the fast transform that is used; None if it is a train, or the diagonal
+    promise : what a trial has shown of the preconditioner in use, for `pctt.pc.watch`; None: it is not watched
     compressed, inverse : trains of the present matrix and of its inverse; None before `make`, and without a train
     rank : cap of the ranks
     failure : why a train that was wanted is not used; empty if all is as asked
@@ -96,6 +50,7 @@ class EntriesTrain:
         self._layout: Layout | None = None
         self.rank = options.max_rank if options.automatic else int(options.rank)
         self.transform: DifferencesInverse | Nystrom | Identity | None = None
+        self.promise: Promise | None = None
         self.compressed: GridTrain | None = None
         self.inverse: Inverse | None = None
         self.symmetric = True
@@ -114,7 +69,8 @@ class EntriesTrain:
         the diagonal, and 1 takes over if it fails. ValueError on all ranks for bad entries or a bad
         grid.
         """
-        self.failure, self.note, self.transform, self._iterations = "", "", None, 50  # if there is no estimate
+        self.failure, self.note, self.transform, self.promise = "", "", None, None
+        self._iterations = 50  # if there is no estimate
         if self.rank == 1:
             return False
         options = self.options
@@ -134,21 +90,23 @@ class EntriesTrain:
         refused = self._make_train(P, layout, options.setup_limit or limit)
         if refused:
             return self._take_no_train(A, P, layout, refused)
-        self.transform = None
+        self.transform = self.promise = None
         return True
 
     def _choose_base(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout) -> float:
         """Choose what is used where no train is; the operations of a solution with it."""
-        self.transform = DifferencesInverse.of(P, layout)
-        product = _product_operations(P, layout, by_fft=self.transform is not None)
-        if isinstance(self.transform, DifferencesInverse):  # an iteration with it takes 1.3 products
-            return 1.3 * product * self.transform.iterations
+        self.transform = found = DifferencesInverse.best_of(P, layout)
+        product = _product_operations(P, layout, by_fft=found is not None)
+        if found is not None:
+            self.promise = found.promise
+            return (1 + found.promise.each) * product * found.promise.iterations
         if not multiplies(A) or not is_symmetric(Entries.of(P), P.getSize()[0]):
             return self._iterations * product
-        found = choose(P, A, product)
-        self.transform = found.inverse or (None if found.scaled else Identity())
-        self._iterations = int(min(found.iterations, 1e9))
-        return found.cost * product
+        chosen = choose(P, A, product)
+        self.transform = chosen.inverse or (None if chosen.scaled else Identity())
+        self.promise = chosen.promise
+        self._iterations = int(min(chosen.iterations, 1e9))
+        return chosen.cost * product
 
     def _take_no_train(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout, why: str) -> bool:
         """Use the base if it is not the diagonal; False: it is. ``why``: a train that was tried has failed."""
@@ -263,6 +221,12 @@ class EntriesTrain:
         """A solve failed; the next matrix is tried again."""
         self.failure = why
 
+    def leave(self, why: str) -> None:
+        """Conjugate gradients are faster without a preconditioner: there is none from now on."""
+        self.account.fall_back(why)
+        self.note, self.promise = why, None
+        self.transform, self.compressed, self.inverse = Identity(), None, None
+
     def use(self, dtype: DTypeLike) -> None:
         """Multiply with the train in this precision; a transform has double precision."""
         if self.transform is None:
@@ -283,9 +247,7 @@ class EntriesTrain:
     @property
     def base(self) -> str:
         """What is used where no train is."""
-        if isinstance(self.transform, DifferencesInverse):
-            return f"the {self.transform.transform.name}"
-        return "block Jacobi" if self.transform is None else self.transform.words
+        return "block Jacobi" if self.transform is None else self.transform.name
 
     @property
     def left(self) -> float:
@@ -298,10 +260,7 @@ class EntriesTrain:
         """What the preconditioner really is, with ranks, errors and sizes."""
         if self.transform is not None:
             reason = f", because {self.note}" if self.note else ""
-            if not isinstance(self.transform, DifferencesInverse):
-                return f"{self.base}, no train{reason}"
-            grid = " x ".join(map(str, self.transform.transform.shape))
-            return f"no train but {self.base} of a grid of {grid}{reason}"
+            return f"{self.transform.words}, no train{reason}"
         assert self.compressed is not None
         assert self.inverse is not None
         X = self.inverse.applied

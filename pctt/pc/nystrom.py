@@ -19,6 +19,7 @@ from scipy import linalg
 
 from dem.exchange import on_first
 from pctt.mat.entries import Entries, diagonal, diagonal_blocks
+from pctt.tt.conjugate import Promise
 from pctt.tt.train import Array
 from pctt.tt.work import ENTRY, MULTIPLY
 
@@ -127,16 +128,6 @@ def _factor(corner: Array, before: Array, chance: Array) -> tuple[Array, Array]:
     return chosen, np.tril(np.array(rows).T[chosen]) if taken else np.zeros((0, 0))
 
 
-class Identity:
-    """No preconditioner."""
-
-    name = words = "no preconditioner"
-    flops = 0
-
-    def __call__(self, x: Array) -> Array:
-        return x
-
-
 class Nystrom:
     """x -> (D + F F')^-1 x for this rank's rows.
 
@@ -198,6 +189,21 @@ class Chosen:
     def cost(self) -> float:
         """Of a solution, in products."""
         return self.iterations * (1 + self.each)
+
+    @property
+    def promise(self) -> Promise | None:
+        """What a solve may take; None if conjugate gradients have no preconditioner, or one that makes no difference.
+
+        The estimates may be too small by a factor of three.
+        """
+        if (self.inverse is None and not self.scaled) or self.iterations == self.alone:
+            return None
+        return Promise(self.each, _falling(3 * self.iterations), _falling(self.alone))
+
+
+def _falling(iterations: float) -> list[float]:
+    """Norms that fall by the same factor until they have lost `DIGITS`."""
+    return list(10.0 ** np.linspace(0.0, -DIGITS, int(min(iterations, 1e4)) + 1))
 
 
 def trial(A: PETSc.Mat, solve: Callable[[Array], Array] | None, steps: int = PROBE) -> float:

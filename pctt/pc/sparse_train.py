@@ -44,7 +44,7 @@ class SparseTrain:
         between trials double until the next structure
     """
 
-    note, base = "", "block Jacobi"
+    note, base, promise = "", "block Jacobi", None
     single_pays = False
     _product: TrainProduct  # of the inverse in use
 

@@ -21,6 +21,7 @@ from pctt.options import describe, read
 from pctt.pc.entries_train import EntriesTrain
 from pctt.pc.options import Account, Options
 from pctt.pc.sparse_train import SparseTrain
+from pctt.pc.watch import Watch
 from pctt.petsc import Context, given_options, on_coordinates, set_failed, warn
 
 NOT_SYMMETRIC = "the matrix is not symmetric, so a train for its inverse may be useless"
@@ -66,6 +67,7 @@ class TensorTrain(Context):
         self._refused = False  # whether the last set-up failed
         self._points: np.ndarray | None = None
         self._last_precision: type = np.float64  # of the last solve
+        self._watch: Watch | None = None  # of the solve that is going on
         self._on_coordinates = on_coordinates(pc, self._take_points)
 
     def destroy(self, pc: PETSc.PC) -> None:
@@ -210,6 +212,8 @@ class TensorTrain(Context):
             self.setUp(pc)
         if self.P is None:
             return
+        if self._watch is not None:
+            self._watch.count()
         if self.failed:
             y.set(np.inf)
         elif self.rank == 1:
@@ -218,6 +222,22 @@ class TensorTrain(Context):
             with PETSc.Log.Event("TTApply"):
                 y.array_w[:] = self.made.times(x.array_r)
                 PETSc.Log.logFlops(self.made.flops)
+
+    def matApply(self, pc: PETSc.PC, X: PETSc.Mat, Y: PETSc.Mat) -> None:
+        """Y = M X for dense Mats; block Jacobi and trains of sparse matrices take one column after the other."""
+        if self._structure is None:
+            self.setUp(pc)
+        x, y = X.getDenseArray(readonly=True), Y.getDenseArray()
+        if self.P is not None and self.rank > 1 and not self.failed and isinstance(self.made, EntriesTrain):
+            with PETSc.Log.Event("TTApply"):
+                y[:] = self.made.times(x.T).T
+                PETSc.Log.logFlops(self.made.flops * x.shape[1])
+            return
+        for k in range(X.getSize()[1]):
+            one, other = X.getDenseColumnVec(k, "r"), Y.getDenseColumnVec(k, "w")
+            self.apply(pc, one, other)
+            X.restoreDenseColumnVec(k, "r")
+            Y.restoreDenseColumnVec(k, "w")
 
     def applyTranspose(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M' x; trains are symmetric, blocks of a matrix may be not."""
@@ -232,6 +252,8 @@ class TensorTrain(Context):
         if self.P is not None and self.rank > 1:
             self._last_precision = self._precision(self._is_unharmed(ksp))
             self.made.use(self._last_precision)
+        promise = None if self.P is None or self.failed else self.made.promise
+        self._watch = Watch(ksp, b, x, promise) if promise is not None and Watch.can(ksp, pc) else None
 
     @staticmethod
     def _is_unharmed(ksp: PETSc.KSP) -> bool:
@@ -252,6 +274,12 @@ class TensorTrain(Context):
             return
         if self.rank > 1:  # whoever calls next may be another method
             self.made.use(self._precision(unharmed=False))
+        if self._watch is not None:
+            watch, self._watch = self._watch, None
+            watch.end()
+            if watch.solution is not None and ksp.getConvergedReason() < 0:
+                self._leave(watch, ksp, b, x)
+                return
         reason = ksp.getConvergedReason()
         if self.rank > 1 and reason < 0:
             used = self._used()
@@ -269,23 +297,41 @@ class TensorTrain(Context):
                 self.made.distrust(self.account.last)
         self.account.used[self._used()] += 1
 
-    def _solve_again(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Solve from zero by the same method with block Jacobi, which other solves with this matrix then use too.
+    def _leave(self, watch: Watch, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Hand the solution of conjugate gradients alone to the KSP; other solves with this matrix then have no
+        preconditioner."""
+        used, products = self._used(), watch.products
+        why = f"conjugate gradients alone take {products} iterations, {used} has not done in as many products"
+        assert isinstance(self.made, EntriesTrain)
+        self.made.leave(why)
+        self.rank = self.made.rank
+        x.array_w[:] = watch.solution
+        self._go_on(ksp, b, x, PETSc.PC.Type.NONE, ksp.getOperators()[1], nonzero=True)
+        self.account.used[self._used()] += 1
 
-        The KSP gets the outcome.
-        """
+    def _solve_again(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Solve from zero by the same method with block Jacobi, which other solves with this matrix then use too."""
         self.rank = 1
         self._make_block_jacobi(self.P)
+        self._go_on(ksp, b, x, PETSc.PC.Type.PBJACOBI, self._own[1])
+
+    @staticmethod
+    def _go_on(
+        ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec, kind: str, P: PETSc.Mat, nonzero: bool = False
+    ) -> None:  # fmt: skip
+        """Solve by the same method with another preconditioner, from zero or from x. The KSP gets the outcome."""
         again = PETSc.KSP().create(ksp.comm)
         again.setType(ksp.getType())
         again.setPCSide(ksp.getPCSide())
         again.setNormType(ksp.getNormType())
         rtol, atol, divtol, max_it = ksp.getTolerances()
         again.setTolerances(rtol, atol, divtol, max_it)
-        again.pc.setType(PETSc.PC.Type.PBJACOBI)
-        again.setOperators(ksp.getOperators()[0], self._own[1])
+        again.setInitialGuessNonzero(nonzero)
+        again.pc.setType(kind)
+        again.setOperators(ksp.getOperators()[0], P)
         again.solve(b, x)
         ksp.setIterationNumber(ksp.getIterationNumber() + again.getIterationNumber())
+        ksp.setResidualNorm(again.getResidualNorm())
         ksp.setConvergedReason(again.getConvergedReason())
         again.destroy()
 
