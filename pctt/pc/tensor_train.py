@@ -11,9 +11,10 @@ from __future__ import annotations
 import time
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import block_diagonal
+from pctt.blocks import block_diagonal, diagonal_matrix
 from pctt.mat.entries import diagonal_blocks, has_entries
 from pctt.mat.order import Places, places_of
 from pctt.options import describe, read
@@ -63,6 +64,7 @@ class TensorTrain(Context):
         self._copy: list[PETSc.Mat] = []  # P, if it is a copy
         self._own: list[PETSc.Object] = []  # block Jacobi and its matrix
         self._warned: set[str] = set()
+        self._refused = False  # whether the last set-up failed
         self._points: np.ndarray | None = None
         self._last_precision: type = np.float64  # of the last solve
         self._watch: Watch | None = None  # of the solve that is going on
@@ -123,17 +125,28 @@ class TensorTrain(Context):
         kind = P.getType().removeprefix("seq").removeprefix("mpi")
         if kind.startswith(("aij", "baij")):
             return P
-        if not kind.startswith(("sbaij", "dense")):
-            allowed = "allowed are aij, baij, sbaij, dense"
-            raise ValueError(f"{self.name}: a Mat of type {P.getType()} has no entries to read; {allowed}")
-        sparse = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
-        if sparse.getBlockSize() != P.getBlockSize():
-            sparse.setBlockSize(P.getBlockSize())
-        for attribute in ("coordinates", "grid", "key"):
-            sparse.setAttr(attribute, P.getAttr(attribute))
+        if kind.startswith(("sbaij", "dense")):
+            sparse = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
+            if sparse.getBlockSize() != P.getBlockSize():
+                sparse.setBlockSize(P.getBlockSize())
+            for attribute in ("coordinates", "grid", "key"):
+                sparse.setAttr(attribute, P.getAttr(attribute))
+        else:
+            sparse = self._diagonal_of(P)
         _destroy(self._copy)
         self._copy = [sparse]
         return sparse
+
+    def _diagonal_of(self, P: PETSc.Mat) -> PETSc.Mat:
+        """The diagonal of a Mat without entries to read; ValueError on all ranks if it has none."""
+        what = f"a Mat of type {P.getType()} has no entries to read"
+        try:
+            diagonal = P.getDiagonal()
+        except PETSc.Error:
+            allowed = "aij, baij, sbaij, dense, any Mat with the attribute entries, or at least MatGetDiagonal"
+            raise ValueError(f"{self.name}: {what}; allowed are {allowed}") from None
+        self._warn(P.comm.tompi4py(), f"{what}: its diagonal is used")
+        return diagonal_matrix(diagonal)
 
     def _begin(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Take what depends on the structure of P only."""
@@ -148,35 +161,39 @@ class TensorTrain(Context):
         self.made = made
         made.begin(P, self.places)
 
-    def _warn(self, words: str) -> None:
-        """Warn, once in the life of this preconditioner; collective."""
-        if words not in self._warned:
-            self._warned.add(words)
-            warn(self.comm, f"{self.name}: {words}")
+    def _warn(self, comm: MPI.Comm, words: str, kind: str = "") -> None:
+        """Warn, once in the life of this preconditioner; or once of this kind. Collective.
+
+        Python's filter shows a text once, so it names the options' prefix, which tells the solvers of a program apart.
+        """
+        if (kind or words) not in self._warned:
+            self._warned.add(kind or words)
+            warn(comm, f"{self.name}{f' of {self.prefix}' if self.prefix else ''}: {words}")
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Make a train or what the rule prefers to it; if this fails, fall back."""
         start, made = time.perf_counter(), self.made
         self.rank = made.rank if made.make(pc.getOperators()[0], P) else 1
         if not made.symmetric:
-            self._warn(NOT_SYMMETRIC)
+            self._warn(self.comm, NOT_SYMMETRIC)
         self.failed = bool(made.failure) and self.options.fallback == "none"
-        if made.failure:
+        if made.failure and not self._refused:
             takes_over = "there is no preconditioner" if self.failed else f"{made.base} takes over"
             sparse = isinstance(made, SparseTrain)
             lost = sparse and self.places.source == "nothing" and self.options.order == "auto"
-            words = [f"{made.failure}: {takes_over}", *[NOWHERE] * lost, *[FASTER] * sparse]
-            self._warn("; ".join(words))
+            reasons = [f"{made.failure}: {takes_over}", *[NOWHERE] * lost, *[FASTER] * sparse]
+            self._warn(self.comm, "; ".join(reasons))
+        self._refused = bool(made.failure)
         if self.rank == 1 and not self.failed:
             self._make_block_jacobi(P)
         set_failed(pc, self.failed)
         self._made_in = time.perf_counter() - start
         self.account.setups += 1
         self.account.setup_s += self._made_in
-        if isinstance(made, EntriesTrain) and made.inverse is not None and made.inverse.residual > 0.5:
-            self._warn(f"the inverse of rank {self.rank} leaves {made.inverse.residual:.2g} of the residual")
-        if self.options.monitor:
-            PETSc.Sys.Print(f"  {self.name}: {self._line()}", comm=P.comm)
+        left = made.left if self.rank > 1 else 0.0
+        if left > 0.5:
+            words = f"the train of rank {self.rank} leaves {left:.2g} of the matrix or of the residual"
+            self._warn(self.comm, words, "leaves")
 
     def _make_block_jacobi(self, P: PETSc.Mat) -> None:
         _destroy(self._own)
@@ -272,7 +289,7 @@ class TensorTrain(Context):
                 again = self.options.fallback == "jacobi"
                 self.account.fall_back(f"{what}, solved again with block Jacobi" if again else what)
                 self.made.distrust(self.account.last)
-                self._warn(self.account.last)
+                self._warn(self.comm, self.account.last)
                 if again:
                     self._solve_again(ksp, b, x)
             elif ksp.getType() not in ("preonly", "richardson"):
@@ -336,6 +353,7 @@ class TensorTrain(Context):
             f"rows ordered by {self.places.source}",
             *([] if symmetric else [NOT_SYMMETRIC]),
             *(f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()),
+            *(["the next matrix is tried again"] if a.fallbacks else []),
         ]
 
     def what(self) -> str:
@@ -354,7 +372,8 @@ class TensorTrain(Context):
         if self.P is None:
             return "made for no system yet"
         if self.rank == 1:
-            note = f", because {self.made.note}" if self.made.note else ""
+            why = self.made.note or self.made.failure
+            note = f", because {why}" if why else ""
             faster = f"; {FASTER}" if isinstance(self.made, SparseTrain) else ""
             return f"rank 1 (block Jacobi{note}), set up in {self._made_in:.2e} s{faster}"
         digits = "single" if self._last_precision is np.float32 and self.made.inverse is not None else "double"

@@ -216,19 +216,54 @@ def test_unsymmetric_and_indefinite_entries_get_no_transform():
             assert made(preconditioner(entries)).transform is None
 
 
-def test_a_train_that_failed_is_not_tried_again():
-    calls = []
+class Fit:
+    """Hyperparameters that change between solves, in one Mat. Entries do not depend on differences."""
 
-    def entries(i, j):
-        calls.append(len(i))
-        return covariance(i, j)
+    def __init__(self, side: int = 24) -> None:
+        self.side, self.length, self.nugget = side, 0.0, 0.0
 
-    with pytest.warns(UserWarning, match="transform takes over"):
-        ksp = preconditioner(entries, rank=30, setup_limit=1e6)
-    first = sum(calls)
-    calls.clear()
-    ksp.getOperators()[0].stateIncrease()
-    ksp.setOperators(ksp.getOperators()[0])
-    ksp.setUp()
-    assert "transform" in made(ksp).base
-    assert sum(calls) < first
+    def __call__(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        x, y = (np.array(np.unravel_index(k, (self.side, self.side))) / self.side for k in (i, j))
+        near = np.exp(-np.sqrt(((x - y) ** 2).sum(axis=0)) / self.length)
+        return (1 + x[0]) * (1 + y[0]) * near + self.nugget * (i == j)
+
+    def set(self, length: float, nugget: float, A: np.ndarray) -> None:
+        self.length, self.nugget = length, nugget
+        A[:] = dense_of(self, self.side**2)
+
+
+@pytest.mark.parallel(1, 2)
+def test_a_refusal_holds_for_its_values():
+    """Easy hyperparameters after hard ones get the train that they get in a new solver."""
+    fit = Fit()
+    A = np.empty((fit.side**2, fit.side**2))
+    mat = shell(fit, A, grid=(fit.side, fit.side))
+    ksp = None
+    for length, nugget, refused in ((0.3, 1e-4, True), (0.03, 1.0, False), (1.0, 1e-4, True), (0.05, 2.0, False)):
+        fit.set(length, nugget, A)
+        mat.stateIncrease()
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            ksp = ksp or solver(mat, rank=8)
+            ksp.setOperators(mat)
+            ksp.setUp()
+        assert bool(made(ksp).failure) == refused
+        assert any("takes over" in str(one.message) for one in heard) == (refused and MPI.COMM_WORLD.rank == 0)
+        if not refused:
+            its, _ = solve(ksp)
+            assert its == solve(ready(mat, rank=8))[0]
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("limit", [3e8, 1e8])
+def test_at_the_limit_of_operations_the_last_inverse_is_kept(limit):
+    """So a larger rank is no worse than a small one, which ends below the limit."""
+    size = 256
+    A = 1.0 / np.add.outer(np.arange(size), np.arange(1, size + 1)) + 1e-3 * np.eye(size)
+    its = {}
+    for rank in (16, 64):
+        ksp = ready(shell(lambda i, j: A[i, j], A, grid=(size,)), rank=rank, setup_limit=limit)
+        assert context(ksp).rank > 1
+        its[rank] = solve(ksp)[0]
+    assert its[64] <= its[16] + 2
+    assert "the limit of operations" in report(ksp)
