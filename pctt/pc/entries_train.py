@@ -20,9 +20,9 @@ from pctt.mat.grid_train import GridTrain, TrainProduct
 from pctt.mat.order import Layout, Places, layout_of
 from pctt.mat.tensor_train import compressed, compressed_entries
 from pctt.pc.mat import finds_negative, iterations_with_the_diagonal
-from pctt.pc.nystrom import Nystrom, choose
+from pctt.pc.nystrom import Identity, Nystrom, choose
 from pctt.pc.options import Account, Options
-from pctt.pc.transforms import DifferencesInverse, Identity
+from pctt.pc.transforms import DifferencesInverse
 from pctt.tt.conjugate import Promise
 from pctt.tt.cross import CROSS
 from pctt.tt.inverse import Inverse, invert_positive
@@ -98,7 +98,7 @@ class EntriesTrain:
         self.transform = found = DifferencesInverse.best_of(P, layout)
         product = _product_operations(P, layout, by_fft=found is not None)
         if found is not None:
-            self.promise = found.promise
+            self.promise = found.promise if found.inverse.kind else None
             return (1 + found.promise.each) * product * found.promise.iterations
         if not multiplies(A) or not is_symmetric(Entries.of(P), P.getSize()[0]):
             return self._iterations * product

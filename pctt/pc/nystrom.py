@@ -128,6 +128,16 @@ def _factor(corner: Array, before: Array, chance: Array) -> tuple[Array, Array]:
     return chosen, np.tril(np.array(rows).T[chosen]) if taken else np.zeros((0, 0))
 
 
+class Identity:
+    """No preconditioner."""
+
+    name = words = "no preconditioner"
+    flops = 0
+
+    def __call__(self, x: Array) -> Array:
+        return x
+
+
 class Nystrom:
     """x -> (D + F F')^-1 x for this rank's rows.
 
@@ -198,12 +208,7 @@ class Chosen:
         """
         if (self.inverse is None and not self.scaled) or self.iterations == self.alone:
             return None
-        return Promise(self.each, _falling(3 * self.iterations), _falling(self.alone))
-
-
-def _falling(iterations: float) -> list[float]:
-    """Norms that fall by the same factor until they have lost `DIGITS`."""
-    return list(10.0 ** np.linspace(0.0, -DIGITS, int(min(iterations, 1e4)) + 1))
+        return Promise.of_iterations(self.each, 3 * self.iterations, self.alone)
 
 
 def trial(A: PETSc.Mat, solve: Callable[[Array], Array] | None, steps: int = PROBE) -> float:

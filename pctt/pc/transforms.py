@@ -17,16 +17,6 @@ from pctt.tt.conjugate import Promise
 from pctt.tt.train import Array
 
 
-class Identity:
-    """No preconditioner."""
-
-    name = words = "no preconditioner"
-    flops = 0
-
-    def __call__(self, x: Array) -> Array:
-        return x
-
-
 class DifferencesInverse:
     """The inverse with which conjugate gradients cost least, of those that fast transforms give, or the identity.
 

@@ -133,13 +133,13 @@ class Differences:
         return values
 
     @property
-    def periodic(self) -> bool:
-        """Whether A is a circulant up to rounding."""
-        apart = 0.0
+    def periodic(self) -> list[bool]:
+        """For each axis, whether a(s) = a(s - n) up to rounding. If all axes are periodic, A is a circulant."""
+        enough, found = 1e-12 * np.abs(self.values).max(), []
         for axis in range(len(self.shape)):
             here, back, _ = self._along(axis, self.values)
-            apart = max(apart, np.abs(here - back)[1:].max(initial=0.0))
-        return bool(apart <= 1e-12 * np.abs(self.values).max())
+            found.append(bool(np.abs(here - back)[1:].max(initial=0.0) <= enough))
+        return found
 
     def means(self) -> Array:
         """The means (n_1, ..., n_D, b, b) over the signs of the coordinates."""
@@ -296,18 +296,23 @@ class Choice:
     promise: Promise
 
 
-def parts(shape: tuple[int, ...]) -> list[tuple[list[int], list[int]]]:
+def parts(shape: tuple[int, ...], periodic: Sequence[bool]) -> list[tuple[list[int], list[int]]]:
     """Numbers of points and their distances of parts of a grid with at most POINTS points: the whole grid, or
-    neighbouring points and points that are spread over the grid."""
+    neighbouring points and points that are spread over the grid. Periodic axes stay whole, if they are short enough.
+    """
     if prod(shape) <= POINTS:
         return [(list(shape), [1] * len(shape))]
-    side = max(1, int(POINTS ** (1 / len(shape)) + 1e-9))
+    whole = prod(n for n, around in zip(shape, periodic) if around)
+    if whole > POINTS / 16:
+        whole, periodic = 1, [False] * len(shape)
+    side = max(1, int((POINTS / whole) ** (1 / (len(shape) - sum(periodic))) + 1e-9))
+    sides = [n if around else side for n, around in zip(shape, periodic)]
     strides = []
-    for n in shape:
+    for n, side in zip(shape, sides):
         least = -(-n // side)  # a divisor keeps what is periodic
         strides.append(next((k for k in range(least, 2 * least) if n % k == 0), least))
     spread = [-(-n // stride) for n, stride in zip(shape, strides)]
-    return [([min(n, side) for n in shape], [1] * len(shape)), (spread, strides)]
+    return [([min(n, side) for n, side in zip(shape, sides)], [1] * len(shape)), (spread, strides)]
 
 
 def choose(a: Differences) -> Choice | None:
@@ -317,12 +322,12 @@ def choose(a: Differences) -> Choice | None:
     spread over the grid how it does far from it. If no preconditioner is good on both, those that win on one of them
     have a trial on the whole grid.
     """
-    if a.periodic:  # which a part of the grid does not show
+    if all(a.periodic):  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
         return Choice(CIRCULANT, Promise(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
     kinds = [kind for kind in CANDIDATES if a.block > 1 or kind != BLOCK_DIAGONAL]
     trials: list[_Trial] = []
-    for counts, strides in parts(a.shape):
+    for counts, strides in parts(a.shape, a.periodic):
         if trials:
             kinds = [kind for kind in kinds if trials[0].costs[kind] < inf or kind in (NOTHING, CIRCULANT)]
         trial = _trial(a.part(counts, strides), kinds)
