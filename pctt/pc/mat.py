@@ -75,6 +75,23 @@ def iterations_with_the_diagonal(A: PETSc.Mat, scale: Array, most: int = 500) ->
     return int(A.comm.tompi4py().bcast(min(most, probe * digits / max(found, probe * digits / most))))
 
 
+def null_vectors(A: PETSc.Mat, P: PETSc.Mat) -> list[Array]:
+    """This rank's parts of vectors that P takes to zero, of the null space of P or A and the constant. Collective."""
+    spaces = [one.getNullSpace() for one in (P, A)]
+    told: list[PETSc.Vec] = next((space.getVecs() for space in spaces if space.handle), [])
+    x, y = P.createVecs()
+    found = []
+    for vec in (None, *told):
+        x.set(1.0) if vec is None else vec.copy(x)
+        P.mult(x, y)
+        size = P.norm(PETSc.NormType.FROBENIUS) * x.norm()
+        if P.comm.tompi4py().bcast(0 < size < np.inf and y.norm() <= 1e-12 * size):
+            found.append(x.array_r.copy())
+    x.destroy()
+    y.destroy()
+    return found
+
+
 def has_negative_diagonal(P: PETSc.Mat) -> bool:
     """Whether all diagonal entries are negative, as in a negative definite matrix. P has entries, or is stored."""
     entries = diagonal(P) if has_entries(P) else P.getDiagonal().array_r

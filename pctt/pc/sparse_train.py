@@ -21,14 +21,14 @@ from pctt import memory
 from pctt.blocks import symmetric_shell
 from pctt.mat.grid_train import TrainProduct
 from pctt.mat.order import Places, chosen_order
-from pctt.pc.mat import finds_negative, is_symmetric
+from pctt.pc.mat import finds_negative, is_symmetric, null_vectors
 from pctt.pc.options import Account, Options
 from pctt.pc.slots import Slots, SlottedMatrix
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.inverse import Inverse, invert, invert_near_identity
 from pctt.tt.quantise import choose_modes
 from pctt.tt.sparse import Compression, SparseHierarchy, compress
-from pctt.tt.train import Array
+from pctt.tt.train import Array, Train, decompose, identity
 
 LEAF = 16  # least number of blocks in the first and in the last mode
 
@@ -105,7 +105,7 @@ class SparseTrain:
         if kept is not None and self._age < self._trial:
             self._use(kept)
             self.account.kept += 1
-        elif not self._try_new(P, slots, kept):
+        elif not self._try_new(A, P, slots, kept):
             return False
         if first:
             self._opening = self.inverse
@@ -122,7 +122,7 @@ class SparseTrain:
         self._product = slots.product()
         return slots
 
-    def _try_new(self, P: PETSc.Mat, slots: SlottedMatrix, kept: Inverse | None) -> bool:
+    def _try_new(self, A: PETSc.Mat, P: PETSc.Mat, slots: SlottedMatrix, kept: Inverse | None) -> bool:
         """Make a train for P and use it, or use the kept train if it is as good; False if no train is positive."""
         csr = P.getValuesCSR()
         if self.hierarchy is None or not slots.lists(csr):
@@ -137,7 +137,8 @@ class SparseTrain:
         with PETSc.Log.Event("TTCompress"):
             self.compression = self._compress(warm)
         with PETSc.Log.Event("TTInvert"):
-            new = on_first(self.comm, lambda: self._invert(warm))
+            null = [slots.spread(slots.images(v)) for v in null_vectors(A, P)]
+            new = on_first(self.comm, lambda: self._invert(warm, null))
             self._use(new)
             positive = self._is_positive(P)
         self.account.reused += warm
@@ -163,12 +164,19 @@ class SparseTrain:
             return compress_cross(self.hierarchy, self.rank, eps, last, rng=rng)
         return compress(self.hierarchy, self.rank, eps, last.train if last else None, rng=rng)
 
-    def _invert(self, warm: bool) -> Inverse:
+    def _invert(self, warm: bool, null: list[Array]) -> Inverse:
+        """The inverse of the train, plus the projections on these vectors of its null space, which would spoil it."""
         assert self.compression is not None
+        train = self.compression.train
+        if null:
+            unit = 1.0 if self.options.scaled else abs(train.inner(identity(train.rows))) / np.prod(train.rows)
+            for v in null:
+                train = train + float(unit) * _projection(v, train.rows)
+            train = train.round(0.1 * self.options.eps)
         start = self.inverse.applied if warm and self.inverse is not None else None
         method = invert_near_identity if self.options.scaled else invert  # block scaling has unit blocks
         rng = np.random.default_rng(self.options.seed)
-        return method(self.compression.train, self.rank, start, eps=self.options.eps, rng=rng)
+        return method(train, self.rank, start, eps=self.options.eps, rng=rng)
 
     def _is_positive(self, P: PETSc.Mat) -> bool:
         """Whether the train in use is positive, as far as a test shows."""
@@ -272,3 +280,10 @@ class SparseTrain:
 def _is_finite(P: PETSc.Mat) -> bool:
     """Whether the entries of this rank's rows are numbers."""
     return bool(np.isfinite(P.getValuesCSR()[2]).all())
+
+
+def _projection(v: Array, modes: tuple[int, ...]) -> Train:
+    """v v' / v'v as a train, with an error of 1e-3."""
+    column = decompose(v / np.linalg.norm(v), 1e-3, modes=modes)
+    matrix = Train([core[:, :, None] for core in column.cores])
+    return matrix @ matrix.T
