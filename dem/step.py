@@ -26,6 +26,7 @@ from dem.system import ContactSystem, contact_arms, contact_frames, gap_velociti
 from dem.together import meet
 from dem.world import World
 
+ALIKE = 0.99  #: cosine between the normals of two linearisations of a contact of which the later one replaces the other
 
 @dataclass(frozen=True)
 class Step:
@@ -222,7 +223,7 @@ def _opening(world: World, contacts: Contacts, position: Floats, velocity: Float
 
 
 def find_turned(
-    world: World, contacts: Contacts, velocity: Floats, dt: float, depth: float, recovery_speed: float
+    world: World, contacts: Contacts, velocity: Floats, dt: float, depth: float, recovery_speed: float, tried: int
 ) -> Contacts | None:
     """The contacts, with those that overlap by more than `depth` [m] if bodies go on for dt [s] with these velocities
     (owned, 6); None if there are none, or if the grains that are no spheres turn by less than that; collective.
@@ -230,7 +231,9 @@ def find_turned(
     A step takes the gap of a contact as linear in the velocities. Where bodies turn, its point and its normal move, and
     other points may meet. What overlaps at the end of the step is linearised there: with the normal n of the end, and
     the gap at the start that leads to the gap of the end with these velocities. This is a step of Newton's method (of
-    sequential quadratic programming) for the gaps at the end of the step.
+    sequential quadratic programming) for the gaps at the end of the step. Where it was `tried` in this time step, what
+    turns between two features would go to and fro for ever: a linearisation with another normal then stays, and the new
+    one is a contact beside it.
     """
     if not _turn(world, velocity[: len(world.grains)], dt, depth):
         return None
@@ -244,9 +247,24 @@ def find_turned(
         return None
     if contacts.linear is not None:
         moved = np.zeros_like(start.point) if start.moved is None else start.moved
-        start = replace(start, moved=moved, linear=start.gap)
+        real = np.maximum(start.gap, -_overlaps_of(contacts, start.body))
+        start = replace(start, moved=moved, linear=start.gap, gap=real)
     found = replace(start, a=a, b=b, near=contacts.near).take(missed)
+    if tried and len(contacts):
+        place = places(contacts.key, found.key)
+        others = np.einsum("ci,ci->c", contacts.normal[place], found.normal) < ALIKE
+        found = replace(found, key=np.where((place >= 0) & others, found.key + 0.5**tried * 1j, found.key))
     return _joined(world, contacts.take(places(found.key, contacts.key) < 0), found)
+
+
+def _overlaps_of(contacts: Contacts, body: Ints) -> Floats:
+    """How deep the pairs of bodies (n, 2) overlap in these contacts; 0 where they do not [m]."""
+    over = contacts.take(contacts.gap < 0.0)
+    pairs, row = np.unique(body @ [1.0, 1.0j], return_inverse=True)
+    pair = places(pairs, over.body @ [1.0, 1.0j])
+    deepest = np.zeros(len(pairs))
+    np.maximum.at(deepest, pair[pair >= 0], -over.gap[pair >= 0])
+    return deepest[row]
 
 
 def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:

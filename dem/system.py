@@ -32,7 +32,7 @@ from dem.applied import (
     joints_refound,
     slots,
 )
-from dem.arrays import Floats, Ints
+from dem.arrays import Floats, Ints, Keys, places
 from dem.bodies import Bodies
 from dem.checks import positive
 from dem.cohesion import along_normal, attraction
@@ -52,6 +52,8 @@ from dem.world import World, turns_unlike_spheres
 
 #: Bodies that contacts turned by more radians in the last step were struck: those impulses do not come again.
 STRUCK = 0.05
+MADE = 0.01  #: energy that impacts may make, as a part of what their impulses exchange, before they bounce less
+PARTS = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 1.0])  #: of e, that are tried from the last to the first
 
 
 class ContactSystem:
@@ -91,11 +93,12 @@ class ContactSystem:
     def __init__(
         self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf,
         joints: Coupling | None = None, spent: Ints | None = None, expected: Floats | None = None,
-        push: Floats | None = None,
+        push: Floats | None = None, eased: tuple[Keys, Floats] | None = None,
     ) -> None:  # fmt: skip
         """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `joints`,
         `spent`: the joints of this step, and what `Drives` has by that name, if contacts have shown them. `expected`:
-        impulses (nc, 3) that the contacts are expected to have, as those of the last step; or `push` if it is known."""
+        impulses (nc, 3) that the contacts are expected to have, as those of the last step; or `push` if it is known.
+        `eased`: contacts that bounce with a part of e alone, by key, from the method of that name."""
         positive("time step", dt)
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
@@ -175,9 +178,10 @@ class ContactSystem:
                 self.problem_map = CellMap(self.resistance.map, self.cell)
             if self.attraction is not None:
                 self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
-        self.at_once = 0
+        self.at_once, self._freely = 0, freely
+        self._bounces, self._part = np.zeros(len(contacts), np.bool_), np.ones(len(contacts))
         if world.pairs.restitution.any():
-            self._bounce(world, contacts, freely[:, 0])
+            self._bounce(world, contacts, freely[:, 0], eased)
         if contacts.parting is not None:
             strikes = np.isfinite(contacts.parting)
             self.b[strikes, 0], self.compliance[strikes] = -contacts.parting[strikes], 0.0
@@ -185,7 +189,9 @@ class ContactSystem:
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
 
-    def _bounce(self, world: World, contacts: Contacts, freely: Floats) -> None:
+    def _bounce(
+        self, world: World, contacts: Contacts, freely: Floats, eased: tuple[Keys, Floats] | None
+    ) -> None:
         """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton).
 
         They begin if without impulses they close in the step, `freely` (nc,) [m/s], and come faster than a fall of one
@@ -199,9 +205,32 @@ class ContactSystem:
         begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & closes
         if contacts.parting is not None:
             begin &= np.isnan(contacts.parting)
-        self.at_once = int(begin.sum())
+        self.at_once, self._bounces = int(begin.sum()), begin
+        if eased is not None:
+            place = places(eased[0], self.key)
+            self._part[place >= 0] = eased[1][place[place >= 0]]
+            e = e * self._part
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
+
+    def eased(self, impulse: Floats, momentum: Floats) -> tuple[Keys, Floats] | None:
+        """Contacts that are to bounce less, by key, and with which part of e: the next one for those whose impulses do
+        work, where all contacts together, with these impulses (parts nc, 3) and momenta, make energy. Newton's law of
+        impacts may do so with friction (Kane and Levinson 1985), and does not at e = 0. None if they make none, or if
+        no part is left; collective."""
+        parts = 1 if self.resistance is None else 2
+        g = impulse.reshape(parts, len(self.key), 3)
+        change = self.problem_map.velocities(momentum.reshape(-1, 6)).reshape(g.shape)
+        slips = [self._freely if self.surface is None else self._freely + np.pad(self.surface, ((0, 0), (1, 0)))]
+        free = np.stack(slips if self.resistance is None else [*slips, self.resistance.velocity])
+        work, exchanged = np.einsum("pci,pci->c", g, free + 0.5 * change), 0.5 * np.einsum("pci,pci->", g, change)
+        less = self._bounces & (work > 0.0) & (self._part > 0.0)
+        sums = self.contact_map.comm.allreduce(np.array([work.sum(), exchanged, less.sum()]))
+        if sums[2] == 0.0 or sums[0] <= MADE * sums[1]:
+            return None
+        self._part[less] = PARTS[np.searchsorted(PARTS, self._part[less]) - 1]
+        eased = self._part < 1.0
+        return self.key[eased], self._part[eased]
 
     def take_hold(self, last: Floats) -> None:
         """Let springs begin with what they held at the end of the last step (nc, 3), as `held_after` gave it, in the

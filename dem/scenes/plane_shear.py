@@ -18,6 +18,7 @@ from dem.record import cell
 from dem.scene import Scene
 from dem.sources import Uniform
 from dem.step import Step
+from dem.time_step import PASSING, SHEARED
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,7 @@ class PlaneShear(Experiment):
     fraction: float = option(0.55, "", "solid fraction at the start; a layer starts as a lattice", between(0.1, 0.58))
     seed: int = option(1, "", "seed of the places and radii", not_negative)
 
-    STRAIN: ClassVar[float] = 0.01  #: shear strain in a step
     LAYERS: ClassVar[float] = 6.0  #: thickness of the cell of a layer, in diameters
-    PASSING: ClassVar[float] = 0.1  #: the step, in the time d sqrt(rho / P) in which the pressure closes a hole
 
     @property
     def time(self) -> float:
@@ -62,7 +61,7 @@ class PlaneShear(Experiment):
     @property
     def dt(self) -> float:  # type: ignore[override]
         """Recommended time step [s]."""
-        return float(f"{min(self.STRAIN / self.rate, self.PASSING * self.time):.2g}")
+        return float(f"{min(SHEARED / self.rate, PASSING * self.time):.2g}")
 
     def build(self) -> Scene:
         """The scene, with the velocities of the shear."""

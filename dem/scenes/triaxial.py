@@ -18,6 +18,7 @@ from dem.record import cell
 from dem.scene import Scene
 from dem.sources import Uniform
 from dem.step import Step
+from dem.time_step import PASSING, STRAINED
 
 
 @dataclass(frozen=True)
@@ -42,15 +43,13 @@ class Triaxial(Experiment):
     fraction: float = option(0.6, "", "solid fraction at the start; with less the sample is loose", between(0.1, 0.62))
     seed: int = option(1, "", "seed of the places and radii", not_negative)
 
-    PASSING: ClassVar[float] = 0.1  #: the step, in the time d sqrt(rho / P) in which the pressure closes a hole
-    STRAIN: ClassVar[float] = 0.002  #: the greatest strain in a step
     PEAK: ClassVar[float] = 0.01  #: the strain over which the stresses of a peak are averaged
 
     @property
     def dt(self) -> float:  # type: ignore[override]
         """Recommended time step [s]."""
         time = 2.0 * self.radius * sqrt(self.density / self.pressure)
-        return float(f"{min(self.PASSING * time, self.STRAIN / self.strain_rate):.2g}")
+        return float(f"{min(PASSING * time, STRAINED / self.strain_rate):.2g}")
 
     def build(self) -> Scene:
         """The scene."""

@@ -10,9 +10,9 @@ So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes
 
 Small problems are the exception: there it goes on to the end, and to an aim beyond the limits. Where friction is
 large, from 2 on, both may fail: APGD circles about the law, and the path of the conic method ends at a wall of its
-cones. So plain projected steps, which do not circle, and the conic method with shorter steps take turns, and at last
-there are cone problems for given De Saxce terms (`pctt.ccp.coulomb`). Where the relaxation has no solution, nothing
-says that Coulomb's law has one.
+cones. So it begins once more without a guess; then plain projected steps, which do not circle, and the conic method
+with shorter steps take turns, and at last there are cone problems for given De Saxce terms (`pctt.ccp.coulomb`). Where
+the relaxation has no solution, nothing says that Coulomb's law has one.
 """
 
 from __future__ import annotations
@@ -77,7 +77,10 @@ def solve(
         else:
             basin = max(limits.tol, options.basin)
             second = tried.conic(guess, conic.Conic(), 0.0 if small else basin)
-            if small and second.status is not Status.GIVEN_UP and second.residual > basin:
+            failed = small and second.status is not Status.GIVEN_UP and second.residual > basin
+            if failed and np.any(guess):  # a guess at the wall of its cones
+                second = tried.conic(np.zeros_like(guess), conic.Conic())
+            if failed and second.residual > basin:
                 tried.in_turns(options, basin)
             elif not (small and second.final):
                 tried.apgd(second.impulse if second.iterations else first.impulse, limits.max_it)

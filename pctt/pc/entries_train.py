@@ -69,8 +69,8 @@ class EntriesTrain:
         the diagonal, and 1 takes over if it fails. ValueError on all ranks for bad entries or a bad
         grid.
         """
-        self.failure, self.note, self.transform, self._iterations = "", "", None, 50  # if there is no estimate
-        self.promise = None
+        self.failure, self.note, self.transform, self.promise = "", "", None, None
+        self._iterations = 50  # if there is no estimate
         if self.rank == 1:
             return False
         options = self.options
@@ -95,19 +95,18 @@ class EntriesTrain:
 
     def _choose_base(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout) -> float:
         """Choose what is used where no train is; the operations of a solution with it."""
-        fast = self.transform = DifferencesInverse.best_of(P, layout)
-        product = _product_operations(P, layout, by_fft=fast is not None)
-        if fast is not None:
-            self.promise = fast.promise if fast.inverse.kind else None
-            return (1 + fast.promise.each) * product * fast.iterations
+        self.transform = found = DifferencesInverse.best_of(P, layout)
+        product = _product_operations(P, layout, by_fft=found is not None)
+        if found is not None:
+            self.promise = found.promise if found.inverse.kind else None
+            return (1 + found.promise.each) * product * found.promise.iterations
         if not multiplies(A) or not is_symmetric(Entries.of(P), P.getSize()[0]):
             return self._iterations * product
-        found = choose(P, A, product)
-        self.transform = found.inverse or (None if found.scaled else Identity())
-        self._iterations = int(min(found.iterations, 1e9))
-        if not isinstance(self.transform, Identity):
-            self.promise = Promise.of_iterations(found.each, found.iterations, found.alone)
-        return found.cost * product
+        chosen = choose(P, A, product)
+        self.transform = chosen.inverse or (None if chosen.scaled else Identity())
+        self.promise = chosen.promise
+        self._iterations = int(min(chosen.iterations, 1e9))
+        return chosen.cost * product
 
     def _take_no_train(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout, why: str) -> bool:
         """Use the base if it is not the diagonal; False: it is. ``why``: a train that was tried has failed."""
@@ -248,9 +247,7 @@ class EntriesTrain:
     @property
     def base(self) -> str:
         """What is used where no train is."""
-        if isinstance(self.transform, DifferencesInverse):
-            return self.transform.name
-        return "block Jacobi" if self.transform is None else self.transform.words
+        return "block Jacobi" if self.transform is None else self.transform.name
 
     @property
     def left(self) -> float:

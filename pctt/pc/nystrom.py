@@ -19,6 +19,7 @@ from scipy import linalg
 
 from dem.exchange import on_first
 from pctt.mat.entries import Entries, diagonal, diagonal_blocks
+from pctt.tt.conjugate import Promise
 from pctt.tt.train import Array
 from pctt.tt.work import ENTRY, MULTIPLY
 
@@ -198,6 +199,16 @@ class Chosen:
     def cost(self) -> float:
         """Of a solution, in products."""
         return self.iterations * (1 + self.each)
+
+    @property
+    def promise(self) -> Promise | None:
+        """What a solve may take; None if conjugate gradients have no preconditioner, or one that makes no difference.
+
+        The estimates may be too small by a factor of three.
+        """
+        if (self.inverse is None and not self.scaled) or self.iterations == self.alone:
+            return None
+        return Promise.of_iterations(self.each, 3 * self.iterations, self.alone)
 
 
 def trial(A: PETSc.Mat, solve: Callable[[Array], Array] | None, steps: int = PROBE) -> float:

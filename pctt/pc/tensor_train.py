@@ -19,6 +19,7 @@ from pctt.mat.entries import diagonal_blocks, has_entries
 from pctt.mat.order import Places, places_of
 from pctt.options import describe, read
 from pctt.pc.entries_train import EntriesTrain
+from pctt.pc.mat import has_negative_diagonal, negated, replaced_blocks, without_singular
 from pctt.pc.options import Account, Options
 from pctt.pc.sparse_train import SparseTrain
 from pctt.pc.watch import Watch
@@ -58,6 +59,7 @@ class TensorTrain(Context):
         self.account = Account()
         self.P: PETSc.Mat | None = None  # the matrix, or a copy of it in AIJ; None if it has no rows
         self.rank = 1
+        self.sign = 1.0  # -1: the train is that of minus the matrix
         self.failed = False  # whether there is no preconditioner, by -pc_tt_fallback none
         self.places = Places()
         self._structure: tuple | None = None
@@ -172,8 +174,12 @@ class TensorTrain(Context):
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Make a train or what the rule prefers to it; if this fails, fall back."""
-        start, made = time.perf_counter(), self.made
-        self.rank = made.rank if made.make(pc.getOperators()[0], P) else 1
+        start, made, A = time.perf_counter(), self.made, pc.getOperators()[0]
+        self.sign = -1.0 if made.rank > 1 and has_negative_diagonal(P) else 1.0
+        operators = [A, P] if self.sign > 0 else [negated(A), negated(P)]
+        self.rank = made.rank if made.make(*operators) else 1
+        if self.sign < 0:
+            _destroy(operators)
         if not made.symmetric:
             self._warn(self.comm, NOT_SYMMETRIC)
         self.failed = bool(made.failure) and self.options.fallback == "none"
@@ -197,7 +203,7 @@ class TensorTrain(Context):
 
     def _make_block_jacobi(self, P: PETSc.Mat) -> None:
         _destroy(self._own)
-        diagonal = block_diagonal(P, diagonal_blocks(P) if has_entries(P) else None)
+        diagonal = block_diagonal(P, without_singular(diagonal_blocks(P)) if has_entries(P) else replaced_blocks(P))
         self._jacobi = PETSc.PC().create(P.comm)
         self._jacobi.setType(PETSc.PC.Type.PBJACOBI)
         self._jacobi.setOperators(diagonal)
@@ -220,7 +226,7 @@ class TensorTrain(Context):
             self._jacobi.apply(x, y)
         else:
             with PETSc.Log.Event("TTApply"):
-                y.array_w[:] = self.made.times(x.array_r)
+                y.array_w[:] = self.sign * self.made.times(x.array_r)
                 PETSc.Log.logFlops(self.made.flops)
 
     def matApply(self, pc: PETSc.PC, X: PETSc.Mat, Y: PETSc.Mat) -> None:
@@ -230,7 +236,7 @@ class TensorTrain(Context):
         x, y = X.getDenseArray(readonly=True), Y.getDenseArray()
         if self.P is not None and self.rank > 1 and not self.failed and isinstance(self.made, EntriesTrain):
             with PETSc.Log.Event("TTApply"):
-                y[:] = self.made.times(x.T).T
+                y[:] = self.sign * self.made.times(x.T).T
                 PETSc.Log.logFlops(self.made.flops * x.shape[1])
             return
         for k in range(X.getSize()[1]):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem.arrays import Ints
+from dem.arrays import Ints, Keys
 from dem.contact import Contacts, find_contacts
 from dem.exchange import reduced
 from dem.fast import refuse_passages
@@ -101,6 +101,7 @@ class Stepper:
 
     def _step(self) -> dict[str, Any]:
         self._corrections, self._shown, self._joints, self._spent, self._push = 0, 0, None, None, None
+        self._eased: tuple[Keys, Array] | None = None
         with log.phase("search"):
             come_and_go(self.world)
             put_back(self.world)
@@ -135,7 +136,7 @@ class Stepper:
         result = self.solve(problem, guess)
         while True:
             again = self._unseen(result.momentum)
-            if again is None and self._machines_are(result):
+            if again is None and self._machines_are(result) and not self._gains(result):
                 return problem, guess, result
             problem, guess = self._assemble(self.contacts if again is None else again, self._remembered(result))
             result = self.solve(problem, guess).after(result)
@@ -175,10 +176,11 @@ class Stepper:
         or those found within this one."""
         self._release()
         given = self.settings.dt, self.settings.recovery_speed, self._joints, self._spent
+        within = self._push, self._eased
         with log.phase("assembly"):
             place = contacts.key, contact_frames(contacts.normal)
             last, _ = self.memory.recall(*place, self._slabs is not self.world.slabs)
-            self.contacts, self.system = contacts, ContactSystem(self.world, contacts, *given, last, self._push)
+            self.contacts, self.system = contacts, ContactSystem(self.world, contacts, *given, last, *within)
             self._push = self.system.push
             guess = last if found is None else found.recall(*place, elsewhere=False)[0]
             self.system.take_hold(last[: len(contacts)])
@@ -200,7 +202,7 @@ class Stepper:
                 wider = in_order(world, wider, dt)
                 return carried(world, contacts, wider) if self._corrections else wider
             if self._corrections < 3 and not world.only_spheres:
-                turned = find_turned(world, contacts, velocity, dt, 0.1 * delta, recovery)
+                turned = find_turned(world, contacts, velocity, dt, 0.1 * delta, recovery, self._corrections)
                 if turned is not None:
                     self._corrections += 1
                     return turned
@@ -229,6 +231,15 @@ class Stepper:
         self._spent = self._spent if spent is None else spent
         self._shown += 1
         return False
+
+    def _gains(self, result: ccp.Result) -> bool:
+        """Whether impacts with these impulses make energy, and are to bounce less; collective."""
+        if not self.world.pairs.restitution.any():
+            return False
+        with log.phase("assembly"):
+            eased = self.system.eased(result.impulse, result.momentum)
+        self._eased = self._eased if eased is None else eased
+        return eased is not None
 
     def _joints_with(self, result: ccp.Result) -> Coupling | None:
         """The joints of the step with the limits and motors that hold with these impulses; None if they are those that

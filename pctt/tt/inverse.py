@@ -290,7 +290,8 @@ def _solve(
             break
     assert whole is not None, "there is at least one sweep"
     X, repaired = whole
-    return Inverse(X, False, residual(S, X, B), count, repaired, stopped=stopped)
+    left = residual(S, X, B)
+    return Inverse(X, False, left, count, repaired, stopped=stopped if left > eps else "")
 
 
 def _rounded(X: Train, left: float, eps: float, measured: Callable[[Train], float]) -> tuple[Train, float]:

@@ -90,6 +90,28 @@ def test_what_ends_a_fall():
     assert recommended_step(falling) == pytest.approx(1e-3, rel=0.06)
 
 
+@pytest.mark.parametrize("size", [1.0, 0.01])
+def test_the_motion_and_the_stress_of_a_cell_have_their_steps(size):
+    """A tenth of d sqrt(rho / P), a shear strain of a hundredth, a strain of .002; a plate moves by its thickness."""
+
+    def step(**given):
+        scene = Scene(0.5, (0, 0, 0), period=(10 * size,) * 3, **given)
+        scene.add_spheres(size * np.array([[1.0, 1.0, 1.0], [4.0, 4.0, 4.0]]), size * np.array([0.5, 0.7]), 2500.0)
+        return recommended_step(scene)
+
+    pressures = 1e4 * size**2 * np.array([1.0, 100.0])
+    for pressure in pressures:
+        expected = 0.1 * size * np.sqrt(2500.0 / pressure)
+        assert step(stress=(pressure / 2, None, pressure)) == pytest.approx(min(expected, 1e-2), rel=0.06)
+    assert step(shear_rate=-20.0) == 5e-4
+    assert step(strain_rate=(None, -4.0, 1.0)) == 5e-4
+    assert step(stress=(1e-9,) * 3) == step() == 1e-2
+    plate = Scene(0.5, (0, 0, 0), period=(10.0,) * 3, stress=(1e6,) * 3)
+    plate.add_boxes([5.0, 5.0, 5.0], (0.5, 0.5, 0.05), 2500.0)
+    mass, wide = 2500.0 * 0.1, 2.0 * np.linalg.norm([0.5, 0.5, 0.05])
+    assert recommended_step(plate) == pytest.approx(0.1 * np.sqrt(6 / np.pi * 0.1 * mass / wide**2 / 1e6), rel=0.06)
+
+
 def test_a_fall_in_the_scenes_of_the_package_asks_for_nothing_more():
     """Beds, and chains of force in them, need more than the grains that fall on them."""
     scene, radius = Mixer(n=4).build(), 0.1

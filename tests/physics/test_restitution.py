@@ -72,3 +72,21 @@ def test_bodies_at_rest_do_not_bounce():
 def test_a_coefficient_is_between_0_and_1(bad):
     with pytest.raises(ValueError, match="restitution must be from 0 to 1"):
         Scene(friction=0.3, restitution=bad)
+
+
+@pytest.mark.parametrize(("angle", "bounces"), [(0.6, 0.9), (0.0, 1.0)])
+def test_a_rod_that_hits_a_rough_floor_gains_no_energy(angle, bounces):
+    """With Newton's law and friction that sticks, this one left with 1.035 times its energy (Kane and Levinson 1985):
+    it bounces with nine tenths of e. An upright one, whose impact loses energy, bounces as ever."""
+    e, radius, half = 0.9, 0.01, 0.1
+    scene = Scene(1.0, (0, 0, 0), restitution=e)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    turn = (np.cos(angle / 2), 0, np.sin(angle / 2), 0)
+    high = half * np.cos(angle) + radius + 0.002
+    scene.add_capsules([[0, 0, high]], radius, half, 1000.0, quaternions=turn, velocity=[1.0, 0, -1.0])
+    with pctt.Simulation(scene, dt=1e-3, tol=1e-8) as sim:
+        tip = np.array([-half * np.sin(angle), 0, -half * np.cos(angle)])
+        energy = [sim.step()["kinetic_energy [J]"] for _ in range(4)]
+        speed = (sim.velocities[:, :3] + np.cross(sim.local.velocity[:, 3:], tip))[0, 2]
+    assert energy[-1] < energy[0]
+    assert speed == pytest.approx(bounces * e, rel=0.05)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drive import RADIUS, spinning
 from mpi4py import MPI
 from several_ranks import alone
 
+from dem import quaternion
 from dem.contact import find_contacts
 from dem.record import energy
 from dem.scene import Scene
@@ -61,10 +64,10 @@ def test_bodies_that_keep_apart_are_left_alone():
     """Far from each other, or turning less than the overlap that is allowed, or spheres."""
     world = new_world(spinning("boxes", 1 / 3), MPI.COMM_SELF)
     contacts, velocity = find_contacts(world, DELTA, DT), np.concatenate([world.grains.velocity, np.zeros((1, 6))])
-    assert find_turned(world, contacts, velocity, DT, 0.01 * RADIUS, np.inf) is None
-    assert find_turned(world, contacts, 100 * velocity, DT, 100 * RADIUS, np.inf) is None
+    assert find_turned(world, contacts, velocity, DT, 0.01 * RADIUS, np.inf, 0) is None
+    assert find_turned(world, contacts, 100 * velocity, DT, 100 * RADIUS, np.inf, 0) is None
     assert world.step == 0
-    assert find_turned(world, contacts, np.nan * velocity, DT, 0.01 * RADIUS, np.inf) is None
+    assert find_turned(world, contacts, np.nan * velocity, DT, 0.01 * RADIUS, np.inf, 0) is None
 
 
 def test_the_gap_at_the_start_leads_to_that_of_the_end():
@@ -79,7 +82,47 @@ def test_the_gap_at_the_start_leads_to_that_of_the_end():
     at_point = [moves[row, :3] + np.cross(moves[row, 3:], new.point - place[row]) for row in (new.a, new.b)]
     change = DT * np.einsum("ci,ci->c", new.normal, at_point[1] - at_point[0])
     gap = dict(zip(end.key, end.gap))
-    np.testing.assert_allclose(new.gap + change, [gap[key] for key in new.key], atol=1e-12)
+    np.testing.assert_allclose(new.linear_gap + change, [gap[key] for key in new.key], atol=1e-12)
+
+
+def boxes_that_hit(**given):
+    """Two boxes that tumble towards each other and hit in the second step, in radii and steps."""
+    scene = Scene(0.5, (0, 0, 0))
+    place = [(0, 0, 0), (-0.4554, -0.6976, -0.6831)]
+    turn = [(0.182, 0.889, 0.371, -0.198), (-0.0572, 0.2836, -0.9403, 0.179)]
+    way = [(0.0349, 0.0154, -0.0485), (-0.0311, 0.0002, 0.0523)]
+    spin = [(0.0002, -0.0029, 0.0066), (0.0043, -0.0169, 0.0103)]
+    scene.add_boxes(
+        place, (0.340, 0.381, 0.418), 1000.0, quaternions=turn, velocity=way, angular_velocity=spin
+    )  # fmt: skip
+    return Simulation(scene, dt=1.0, delta=0.02, comm=MPI.COMM_SELF, **given)
+
+
+def test_bodies_overlap_by_no_more_than_they_do():
+    """A contact that is linearised at the end of the step may start from a linear gap far beneath zero."""
+    sim = boxes_that_hit()
+    linear = []
+    for _ in range(4):
+        assert sim.step()["worst_overlap"] < 0.01
+        linear.append(sim.stepper.contacts.linear_gap.min(initial=0.0))
+    assert min(linear) < -0.05
+
+
+def test_a_second_linearisation_of_another_direction_stands_beside_the_first():
+    """What turns between two features would be linearised to and fro, and overlap in the end."""
+    sim = boxes_that_hit()
+    sim.step()
+    world, depth = sim.world, 1e-3
+    velocity = world.grains.velocity
+    first = find_turned(world, find_contacts(world, 0.02, 1.0), velocity, 1.0, depth, np.inf, 0)
+    for angle, stands in ((0.01, False), (0.4, True)):
+        turn = quaternion.exponential(angle * np.eye(3)[:1])
+        turned = replace(first, normal=quaternion.rotate(np.repeat(turn, len(first), axis=0), first.normal))
+        again = find_turned(world, turned, velocity, 1.0, depth, np.inf, 1)
+        assert set(turned.key) <= set(again.key)
+        assert (len(again) > len(turned)) == stands
+        assert len(set(again.key)) == len(again)
+        assert len(find_turned(world, turned, velocity, 1.0, depth, np.inf, 0)) == len(turned)
 
 
 def found_of(comm):
@@ -89,7 +132,7 @@ def found_of(comm):
     world.grains.velocity *= [12, 12, 12, 1, 1, 1]
     velocity = np.concatenate([world.grains.velocity, np.zeros((world.owned - len(world.grains), 6))])
     contacts = find_contacts(world, DELTA, DT)
-    found = find_turned(world, contacts, velocity, DT, 0.01 * RADIUS, np.inf)
+    found = find_turned(world, contacts, velocity, DT, 0.01 * RADIUS, np.inf, 0)
     return world, contacts, velocity, found
 
 
