@@ -32,7 +32,7 @@ from pctt.tt.conjugate import PATIENCE, ConjugateGradients, Promise, iterations,
 from pctt.tt.train import Array
 
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
-POINTS = 4096  # most points of a part of the grid, on which solutions are tried
+POINTS = 4096  # most points of a part of the grid, on which solutions are tried; with 1024 two of 26 choices were bad
 SLACK = 1.5  # a preconditioner that costs so many times more than another one on a part is not tried further
 MOST = 400.0  # products that a trial may cost
 
