@@ -58,9 +58,9 @@ class WatchedSparseTrain(SparseTrain):
         self.rows[-1] |= {"matrix_rank": mean_rank(found.train.ranks)}
         return found
 
-    def _invert(self, warm: bool):
+    def _invert(self, warm: bool, null: list[np.ndarray]):
         start = time.perf_counter()
-        inverse = super()._invert(warm)
+        inverse = super()._invert(warm, null)
         self.rows[-1] |= {"invert_s": time.perf_counter() - start, "residual": inverse.residual}
         # what is stored of I + Z is Z, of one rank less
         self.rows[-1] |= {"inverse_rank": mean_rank(inverse.applied.ranks) + inverse.identity}
