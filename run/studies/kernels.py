@@ -198,7 +198,8 @@ def others() -> dict[str, Callable[[], Problem]]:
         "bessel": lambda: signed((128, 128), lambda x, y: special.j0(0.3 * np.hypot(x, y)), 0.1),
         "separable": lambda: signed((24, 24, 20), lambda x, y, t: np.exp(-np.hypot(x, y) / 6 - np.abs(t) / 8), 0.01),
         "gneiting": lambda: signed(
-            (24, 24, 20), lambda x, y, t: np.exp(-np.hypot(x, y) / 6 / (1 + np.abs(t) / 5) ** 0.5) / (1 + np.abs(t) / 5), 0.01),
+            (24, 24, 20),
+            lambda x, y, t: np.exp(-np.hypot(x, y) / (36 + 7.2 * np.abs(t)) ** 0.5) / (1 + np.abs(t) / 5), 0.01),
         "moving": lambda: signed((96, 96), lambda x, t: np.exp(-np.hypot((x - 0.8 * t) / 6, t / 12)), 0.01),
         "moving3": lambda: signed(
             (24, 24, 20), lambda x, y, t: np.exp(-np.hypot(np.hypot(x - 0.5 * t, y) / 6, t / 9)), 0.01),
