@@ -648,18 +648,15 @@ for kind in ("jacobi", "icc", "python"):
 import numpy as np
 from petsc4py import PETSc
 
-from pctt.mat import from_entries
-
-n = 32
-grid = (n, n)
+from pctt.mat import from_differences
 
 
-def entries(i, j):
-    x, y = (np.array(np.unravel_index(k, grid)) / n for k in (i, j))
-    return (i == j) + 50 / n**2 * np.exp(-((x - y) ** 2).sum(axis=0) / 0.02)
+def covariance(s):  # differences of grid indices (2, p)
+    return np.exp(-np.hypot(s[0] - 0.5 * s[1], s[1]) / 10)
 
 
-A = from_entries(entries, grid, eps=1e-9)
+A = from_differences(covariance, (60, 50))
+A.shift(0.01)  # a nugget
 x, b = A.createVecs()
 b.set(1.0)
 for kind in ("none", "python"):

@@ -55,6 +55,15 @@ def new_matrix(
     return mat
 
 
+def diagonal_matrix(diagonal: PETSc.Vec) -> PETSc.Mat:
+    """A new AIJ Mat with this diagonal."""
+    rows, first = diagonal.getLocalSize(), diagonal.getOwnershipRange()[0]
+    indptr = np.arange(rows + 1, dtype=PETSc.IntType)
+    csr = (indptr, indptr[:-1] + indptr.dtype.type(first), diagonal.array_r.copy())
+    sizes = (rows, PETSc.DETERMINE)
+    return new_matrix(diagonal.comm.tompi4py(), (sizes, sizes), 1, csr, PETSc.Mat.Type.AIJ)
+
+
 # -- diagonal blocks -----------------------------------------------------------------------------------------
 
 

@@ -37,7 +37,7 @@ require_real_double()  # here, as every package that uses PETSc imports this mod
 
 #: The methods that PETSc calls by name.
 CALLED = (
-    "setFromOptions", "setUp", "apply", "applyTranspose", "mult", "multTranspose", "getDiagonal", "view",
+    "setFromOptions", "setUp", "apply", "applyTranspose", "matApply", "mult", "multTranspose", "getDiagonal", "view",
     "scale", "shift", "zeroEntries", "diagonalScale", "norm", "duplicate", "copy",
 )  # fmt: skip
 _raised: list[BaseException] | None = None  # errors that contexts raised since the innermost `own_errors` began

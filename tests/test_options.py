@@ -128,7 +128,7 @@ def test_a_name_like_none_of_ours_gets_a_pointer_to_the_help():
 
 
 @pytest.mark.parametrize("name", [
-    "ksp_type", "pc_tt_max_rank", "mat_mumps_icntl_14", "sub_pc_type", "log_view", "options_file", "help",
+    "ksp_type", "pc_tt_rank", "mat_mumps_icntl_14", "sub_pc_type", "log_view", "options_file", "help",
     "malloc_debug", "on_error_abort", "start_in_debugger", "citations", "viewer_binary_skip_info",
     "compare_ilu_pc_factor_levels",
 ])  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt.pc import TensorTrain
+from pctt.pc.options import Options
 
 Entries = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -68,7 +70,7 @@ def dense_mat(A: np.ndarray, comm: Any = PETSc.COMM_WORLD, **attributes: object)
     return with_attributes(mat, **attributes)
 
 
-def shell(entries: Any, A: np.ndarray, **attributes: object) -> PETSc.Mat:
+def shell(entries: Any, A: np.ndarray, block: int = 1, **attributes: object) -> PETSc.Mat:
     """A Mat that a user has written, with dense products by A, and with this function of its entries."""
 
     class Shell:
@@ -76,7 +78,10 @@ def shell(entries: Any, A: np.ndarray, **attributes: object) -> PETSc.Mat:
             y.array_w[:] = A[slice(*y.getOwnershipRange())] @ gathered(x)
 
     sizes = (PETSc.DECIDE, len(A))
-    mat = PETSc.Mat().createPython((sizes, sizes), Shell(), comm=PETSc.COMM_WORLD)
+    mat = PETSc.Mat().create(PETSc.COMM_WORLD)
+    mat.setSizes((sizes, sizes), block)
+    mat.setType(PETSc.Mat.Type.PYTHON)
+    mat.setPythonContext(Shell())
     mat.setUp()
     return with_attributes(mat, entries=entries, **attributes)
 
@@ -95,7 +100,9 @@ def poisson(n: int) -> PETSc.Mat:
 def solver(
     mat: PETSc.Mat, ksp_type: str = "cg", rtol: float = 1e-8, prefix: str = "", **options: object
 ) -> PETSc.KSP:
-    """A KSP with the train as preconditioner, by these options -pc_tt_*."""
+    """A KSP with the train as preconditioner, by these options -pc_tt_*, or numbers of `pctt.pc.options`."""
+    numbers = {f.name for f in fields(Options) if "python_only" in f.metadata} & options.keys()
+    set_here = {name: options.pop(name) for name in numbers}
     for name, value in options.items():
         PETSc.Options()[f"{prefix}pc_tt_{name}"] = str(value)
     ksp = PETSc.KSP().create(mat.comm)
@@ -106,6 +113,7 @@ def solver(
     ksp.pc.setType("python")
     ksp.pc.setPythonType("pctt.pc.TensorTrain")
     ksp.setFromOptions()
+    context(ksp).options = replace(context(ksp).options, **set_here)
     return ksp
 
 

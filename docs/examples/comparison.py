@@ -112,7 +112,7 @@ def cg(
     note = ""
     if pc in ("tt", "auto"):
         made = ksp.pc.getPythonContext().made
-        note = made.base.removeprefix("the ")
+        note = made.base
         if made.inverse is not None:
             Z = made.inverse.train
             bytes_ += 8 * (Z.storage + made.compressed.train.storage)

@@ -33,14 +33,19 @@ class WholeVectors:
         self.comm, self.counts = comm, np.asarray(counts)
         first = int(self.counts[: comm.rank].sum())
         self.mine = slice(first, first + int(self.counts[comm.rank]))
-        self._whole = np.empty(int(self.counts.sum()) if comm.size > 1 else 0)
 
     def __call__(self, x: Array) -> Array:
-        """All of x, from this rank's part; valid until the next call."""
+        """All of x, from this rank's part, of a vector (n,) or of several (k, n)."""
         if self.comm.size == 1:
             return x
-        self.comm.Allgatherv(np.ascontiguousarray(x), [self._whole, self.counts])
-        return self._whole
+        columns, rows = x[None] if x.ndim == 1 else x, int(self.counts.sum())
+        parts = np.empty(len(columns) * rows)
+        self.comm.Allgatherv(np.ascontiguousarray(columns), [parts, len(columns) * self.counts])
+        if len(columns) > 1:
+            ends = len(columns) * np.cumsum(self.counts)[:-1]
+            blocks = np.split(parts, ends)
+            parts = np.concatenate([b.reshape(len(columns), n) for b, n in zip(blocks, self.counts)], axis=1)
+        return parts.reshape(*x.shape[:-1], rows)
 
 
 class TrainProduct:
@@ -85,34 +90,41 @@ class TrainProduct:
     def set_train(self, train: Train) -> None:
         """Multiply with this matrix train of `size` rows and columns from now on."""
         self.train = train
-        self._applies: dict[np.dtype, Apply] = {}
+        self._applies: dict[tuple[np.dtype, int], Apply] = {}
 
     def use(self, dtype: DTypeLike) -> None:
         """Multiply in single or double precision from now on; products in single precision have errors of 1e-6."""
         self._dtype = dtype
 
-    @property
-    def _apply(self) -> Apply:
-        dtype = np.dtype(self._dtype)
-        if dtype not in self._applies:
-            self._applies[dtype] = Apply(self.train.astype(dtype), self.size, self._bounds)
-        return self._applies[dtype]
+    def _apply(self, columns: int = 1) -> Apply:
+        """The product with so many vectors at a time: that of the train with the identity as one more core."""
+        key = np.dtype(self._dtype), columns
+        if key not in self._applies:
+            cores = list(self.train.astype(key[0]).cores)
+            if columns > 1:
+                cores.append(np.eye(columns, dtype=key[0]).reshape(1, columns, columns, 1))
+            bounds = columns * self._bounds[0], columns * self._bounds[1]
+            self._applies = {known: apply for known, apply in self._applies.items() if known[1] == 1}
+            self._applies[key] = Apply(Train(cores), columns * self.size, bounds)
+        return self._applies[key]
 
     @property
     def flops(self) -> int:
-        return self._apply.flops
+        return self._apply().flops
 
     def __call__(self, x: Array) -> Array:
-        """The product; the array is valid until the next call."""
-        apply, x, largest = self._apply, self._gather(x), 1.0
+        """The product with a vector (n,), or with several (k, n); the array is valid until the next call."""
+        columns = 1 if x.ndim == 1 else len(x)
+        apply, x, largest = self._apply(columns), self._gather(x), 1.0
         if apply.dtype != float:
             largest = float(np.abs(x).max(initial=0.0)) or 1.0  # single precision overflows at 1e38
             x = x / largest
-        apply.x[self._slots] = x
-        y = apply.product()
+        apply.x.reshape(-1, columns)[self._slots] = x.reshape(columns, -1).T
+        y = apply.product().reshape(-1, columns).T
         if apply.dtype != float:
             y = np.multiply(largest, y, dtype=float)
-        return (y if self._apart else self._gather_product(y))[self._here]
+        y = (y if self._apart else self._gather_product(y))[:, self._here]
+        return y.reshape(*x.shape[:-1], y.shape[1])
 
 
 def _consecutive(numbers: Array) -> bool:

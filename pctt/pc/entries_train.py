@@ -1,7 +1,7 @@
 """A preconditioner of a matrix on a grid that is given by its entries: a fast transform, or the train of an inverse.
 
-Where the entries depend on differences of points only, a cosine or sine transform (`pctt.tt.differences`) costs next to
-nothing. Otherwise cross approximation compresses the matrix, which is not scaled, and its inverse is computed.
+Where the entries depend on differences of points only, a fast transform (`pctt.pc.transforms`) costs next to nothing.
+Otherwise cross approximation compresses the matrix, which is not scaled, and its inverse is computed.
 `EntriesTrain.make` is the rule of -pc_tt_rank auto, in operations (about a nanosecond each, `pctt.tt.work`).
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from math import log2, prod
 
-import numpy as np
 from mpi4py import MPI
 from numpy.typing import DTypeLike
 from petsc4py import PETSc
@@ -17,69 +16,25 @@ from petsc4py import PETSc
 from dem.exchange import on_first
 from pctt.blocks import symmetric_shell
 from pctt.mat.entries import DENSE, Entries, diagonal, is_symmetric, multiplies
-from pctt.mat.grid_train import GridTrain, TrainProduct, WholeVectors
+from pctt.mat.grid_train import GridTrain, TrainProduct
 from pctt.mat.order import Layout, Places, layout_of
 from pctt.mat.tensor_train import compressed, compressed_entries
 from pctt.pc.mat import finds_negative, iterations_with_the_diagonal
+from pctt.pc.nystrom import Identity, Nystrom, choose
 from pctt.pc.options import Account, Options
-from pctt.tt import differences
+from pctt.pc.transforms import DifferencesInverse
+from pctt.tt.conjugate import Promise
 from pctt.tt.cross import CROSS
 from pctt.tt.inverse import Inverse, invert_positive
 from pctt.tt.train import Array
 from pctt.tt.work import TooMuchWorkError, Work, apply_operations
 
 
-class DifferencesInverse:
-    """The inverse of the fast transform that is nearest to a matrix whose entries depend on differences.
-
-    transform : see `pctt.tt.differences.FastTransform`
-    iterations : those of conjugate gradients on a part of the grid, to 1e-8
-    """
-
-    def __init__(self, layout: Layout, transform: differences.FastTransform, iterations: int) -> None:
-        self.gather, self.order = WholeVectors(layout.comm, layout.counts), layout.rows
-        self.transform, self.iterations = transform, iterations
-
-    @classmethod
-    def of(cls, P: PETSc.Mat, layout: Layout) -> DifferencesInverse | None:
-        """For a Mat with entries; None if they do not depend on differences, or are not symmetric and positive.
-
-        Collective; ValueError on all ranks.
-        """
-        if P.getBlockSize() > 1:
-            return None
-        entries, shape, comm = Entries.of(P), layout.digits.shape, layout.comm
-        even = differences.depend_on_differences(entries, shape, layout.rows, np.random.default_rng(0))
-        if even is None or not is_symmetric(entries, layout.digits.rows):
-            return None
-        means = differences.means_of_differences(entries, shape, layout.rows, even)
-        # what other ranks find best may differ by rounding
-        found = on_first(comm, lambda: differences.best(means))
-        if found is None:
-            return None
-        transform = differences.FastTransform(means, found[0])
-        return cls(layout, transform, found[1]) if comm.bcast(transform.positive) else None
-
-    def __call__(self, x: Array) -> Array:
-        """This rank's part of the product, from its part of x. Every rank transforms the whole vector."""
-        x = self.gather(x)
-        if self.order is None:
-            return self.transform.solve(x)[self.gather.mine]
-        out = np.empty_like(x)
-        out[self.order] = self.transform.solve(x[self.order])
-        return out[self.gather.mine]
-
-    @property
-    def flops(self) -> int:
-        """Operations of this rank in a product: two transforms."""
-        rows = prod(self.transform.shape)
-        return int(5 * rows * log2(max(2, rows)))
-
-
 class EntriesTrain:
     """`make` makes a preconditioner for a matrix, `times` multiplies with it.
 
-    transform : the fast transform that is used; None if it is a train, or nothing
+    transform : the fast transform that is used; None if it is a train, or the diagonal
+    promise : what a trial has shown of the preconditioner in use, for `pctt.pc.watch`; None: it is not watched
     compressed, inverse : trains of the present matrix and of its inverse; None before `make`, and without a train
     rank : cap of the ranks
     failure : why a train that was wanted is not used; empty if all is as asked
@@ -93,19 +48,19 @@ class EntriesTrain:
         self._named = f"-{prefix}pc_tt_"  # how the names of the options begin
         self._places = places
         self._layout: Layout | None = None
-        self.rank = options.max_rank or 100 if options.automatic else int(options.rank)
-        self.transform: DifferencesInverse | None = None
+        self.rank = options.max_rank if options.automatic else int(options.rank)
+        self.transform: DifferencesInverse | Nystrom | Identity | None = None
+        self.promise: Promise | None = None
         self.compressed: GridTrain | None = None
         self.inverse: Inverse | None = None
         self.symmetric = True
         self.failure = self.note = ""
-        self._refused = ""  # why there was no train of an earlier matrix; it is not tried again
-        self._distrusted = ""  # why nothing but the diagonal is used any more
 
     def make(self, A: PETSc.Mat, P: PETSc.Mat) -> bool:
         """Make a preconditioner. False: the diagonal is better, or nothing else worked; `failure` or `note` say why.
 
-        1. If entries depend on differences, CG with a fast transform would do; otherwise CG with the diagonal.
+        1. If entries depend on differences, CG with a fast transform would do; otherwise CG with the best of the
+           diagonal, Nystrom's approximation and nothing (`pctt.pc.nystrom.choose`).
         2. A train may take a quarter of the operations of this solution, unless -pc_tt_setup_limit is given. If the
            quarter is less than `pays`, no train is tried.
         3. If there is no train within the limit, or if it is not positive, 1 takes over.
@@ -114,33 +69,47 @@ class EntriesTrain:
         the diagonal, and 1 takes over if it fails. ValueError on all ranks for bad entries or a bad
         grid.
         """
-        self.failure, self.note, self.transform = self._distrusted, "", None
-        if self.rank == 1 or self._distrusted:
+        self.failure, self.note, self.transform, self.promise = "", "", None, None
+        self._iterations = 50  # if there is no estimate
+        if self.rank == 1:
             return False
-        options, iterations = self.options, 50  # if there is no estimate
+        options = self.options
         layout = self._layout = self._layout or layout_of(P, options.order, f"{self._named}order", self._places)
-        product = _product_operations(P, layout)
         if options.automatic and options.eps >= options.coarse:
-            self.transform = DifferencesInverse.of(P, layout)
-        if self.transform is not None:  # an iteration with it takes 1.3 products
-            limit = options.part * 1.3 * product * self.transform.iterations
+            limit = options.part * self._choose_base(A, P, layout)
         else:
+            product = _product_operations(P, layout, by_fft=True)
             if multiplies(A) and (options.automatic or 20 * product < options.pays):  # six products are cheap
-                iterations = iterations_with_the_diagonal(A, diagonal(P))
-            cost = iterations * product
+                self._iterations = iterations_with_the_diagonal(A, diagonal(P))
+            cost = self._iterations * product
             limit = options.part * cost if options.automatic else options.pays + cost
         if options.automatic and limit < options.pays:
             if self.transform is None:
-                self.note = f"conjugate gradients take about {iterations} iterations, so a train does not pay"
-            return self._take_no_train(P, layout, "")
-        self._refused = self._refused or self._make_train(P, layout, options.setup_limit or limit)
-        if self._refused:
-            return self._take_no_train(P, layout, self._refused)
-        self.transform = None
+                self.note = f"conjugate gradients take about {self._iterations} iterations, so a train does not pay"
+            return self._take_no_train(A, P, layout, "")
+        refused = self._make_train(P, layout, options.setup_limit or limit)
+        if refused:
+            return self._take_no_train(A, P, layout, refused)
+        self.transform = self.promise = None
         return True
 
-    def _take_no_train(self, P: PETSc.Mat, layout: Layout, why: str) -> bool:
-        """Use the transform if there is one; False: there is none. ``why``: a train that was tried has failed."""
+    def _choose_base(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout) -> float:
+        """Choose what is used where no train is; the operations of a solution with it."""
+        self.transform = found = DifferencesInverse.best_of(P, layout)
+        product = _product_operations(P, layout, by_fft=found is not None)
+        if found is not None:
+            self.promise = found.promise if found.inverse.kind else None
+            return (1 + found.promise.each) * product * found.promise.iterations
+        if not multiplies(A) or not is_symmetric(Entries.of(P), P.getSize()[0]):
+            return self._iterations * product
+        chosen = choose(P, A, product)
+        self.transform = chosen.inverse or (None if chosen.scaled else Identity())
+        self.promise = chosen.promise
+        self._iterations = int(min(chosen.iterations, 1e9))
+        return chosen.cost * product
+
+    def _take_no_train(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout, why: str) -> bool:
+        """Use the base if it is not the diagonal; False: it is. ``why``: a train that was tried has failed."""
         self.compressed = self.inverse = None
         if self.transform is not None:
             self.note = why
@@ -148,49 +117,69 @@ class EntriesTrain:
             self.account.fall_back(why)
             self.failure = why
             if not self.options.automatic:
-                self.transform = DifferencesInverse.of(P, layout)
+                self._choose_base(A, P, layout)
         return self.transform is not None
 
     def _make_train(self, P: PETSc.Mat, layout: Layout, limit: float) -> str:
-        """Make a train with at most this number of operations; the reason if there is no positive one.
+        """Make a train of at most the rank that is asked for; the reason if there is no positive one.
 
-        eps is lowered three times if the train of the matrix or of its inverse is not positive.
+        If the limit of operations ends an attempt that has come to nothing, one with a fourth of the rank follows, to
+        which trains near the limit would be no better.
+        """
+        first, cap = "", self.rank
+        if self.options.reuse == "none":
+            self.compressed = None
+        while True:
+            why, stopped = self._try_train(P, layout, limit, cap)
+            if not why:
+                return ""
+            first, cap = first or why, cap // 4
+            if not stopped or cap < 5:
+                return first
+
+    def _try_train(self, P: PETSc.Mat, layout: Layout, limit: float, cap: int) -> tuple[str, bool]:
+        """Make a train of at most this rank with at most this number of operations.
+
+        eps is lowered three times if the train of the matrix or of its inverse is not positive. The result says why
+        there is no positive train, and whether the limit is to blame; ("", False) if there is one.
         """
         work, eps = Work(limit), self.options.eps
         try:
             for _ in range(4):
-                warm = self.compressed is not None and self.options.reuse != "none"
+                warm = self.compressed is not None
                 with PETSc.Log.Event("TTCompress"):
-                    A = self.compressed = self._compress(P, layout, eps, self.compressed if warm else None, work)
+                    A = self.compressed = self._compress(P, layout, eps, cap, self.compressed, work)
                 self.symmetric = A.symmetric
                 if A.shift <= 0:
-                    return "the mean of the diagonal is not positive"
+                    return "the mean of the diagonal is not positive", False
                 self.account.reused += warm
                 with PETSc.Log.Event("TTInvert"):
-                    X = self.inverse = self._invert(A, eps, work)
+                    X = self.inverse = self._invert(A, cap, eps, work)
                     if X is not None:
                         self._product = A.product(X.applied)
                         if X.certain or not self._is_negative(P):
-                            return ""
+                            return "", False
+                        if X.stopped:
+                            return self._too_much(X.stopped, work), True
                         if X.residual > eps:
                             break  # the rank cannot reach this accuracy, and even less a higher one
                 eps *= 0.05
-            return self._why_not_positive(A, X)
+            return self._why_not_positive(A, X, cap), False
         except TooMuchWorkError as stopped:
-            return self._too_much(str(stopped), work)
+            return self._too_much(str(stopped), work), True
 
     def _compress(
-        self, P: PETSc.Mat, layout: Layout, eps: float, start: GridTrain | None, work: Work
+        self, P: PETSc.Mat, layout: Layout, eps: float, cap: int, start: GridTrain | None, work: Work
     ) -> GridTrain:
         known = compressed(P)
         if known is not None and known.error <= eps and self.options.order in ("auto", known.layout.order):
-            return known.rounded(0.5 * eps, self.rank)
-        return compressed_entries(P, layout, eps, self.rank, start, work)
+            return known.rounded(0.5 * eps, cap)
+        return compressed_entries(P, layout, eps, cap, start, work)
 
-    def _invert(self, A: GridTrain, eps: float, work: Work) -> Inverse | None:
+    def _invert(self, A: GridTrain, cap: int, eps: float, work: Work) -> Inverse | None:
         """The inverse of A / c; None if its train turns out not to be positive."""
         found, work.spent = on_first(
-            self.comm, lambda: (invert_positive(A.train, self.rank, eps, work=work), work.spent)
+            self.comm, lambda: (invert_positive(A.train, cap, eps, work=work), work.spent)
         )
         return found
 
@@ -217,20 +206,26 @@ class EntriesTrain:
             return f"{limit}: the ranks of the matrix grow, which is hopeless in this order of the points"
         return f"{limit}: a train costs more than one solution without it; raise the limit for many right-hand sides"
 
-    def _why_not_positive(self, A: GridTrain, X: Inverse | None) -> str:
+    def _why_not_positive(self, A: GridTrain, X: Inverse | None, cap: int) -> str:
         missed = f"the train of the matrix leaves {A.error:.1e} of it"
         if X is None:
             return f"the train of the matrix is not positive, {missed}: lower {self._named}eps"
         if X.residual <= self.options.eps:
             return f"the inverse is not positive, because {missed}: lower {self._named}eps"
-        why = f"the inverse of rank {self.rank} is not positive, it leaves {X.residual:.1e} of the residual"
+        why = f"the inverse of rank {cap} is not positive, it leaves {X.residual:.1e} of the residual"
         return f"{why}: " + (f"raise {self._named}rank" if X.residual < 1 else "this is hopeless")
 
     # -- application ----------------------------------------------------------------------------------------
 
     def distrust(self, why: str) -> None:
-        """A solve failed: the diagonal is used from now on."""
-        self._distrusted = why
+        """A solve failed; the next matrix is tried again."""
+        self.failure = why
+
+    def leave(self, why: str) -> None:
+        """Conjugate gradients are faster without a preconditioner: there is none from now on."""
+        self.account.fall_back(why)
+        self.note, self.promise = why, None
+        self.transform, self.compressed, self.inverse = Identity(), None, None
 
     def use(self, dtype: DTypeLike) -> None:
         """Multiply with the train in this precision; a transform has double precision."""
@@ -252,26 +247,37 @@ class EntriesTrain:
     @property
     def base(self) -> str:
         """What is used where no train is."""
-        return "block Jacobi" if self.transform is None else f"the {self.transform.transform.name}"
+        return "block Jacobi" if self.transform is None else self.transform.name
+
+    @property
+    def left(self) -> float:
+        """What the trains leave of the matrix or of the residual, the larger part; 0 without trains."""
+        if self.compressed is None or self.inverse is None:
+            return 0.0
+        return max(self.compressed.error, self.inverse.residual)
 
     def words(self) -> str:
         """What the preconditioner really is, with ranks, errors and sizes."""
         if self.transform is not None:
             reason = f", because {self.note}" if self.note else ""
-            grid = " x ".join(map(str, self.transform.transform.shape))
-            return f"no train but {self.base} of a grid of {grid}{reason}"
+            return f"{self.transform.words}, no train{reason}"
         assert self.compressed is not None
         assert self.inverse is not None
         X = self.inverse.applied
-        return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}"
+        stopped = self.inverse.stopped
+        stopped = stopped and f"; the limit of operations ({self._named}setup_limit) ended {stopped}"
+        return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}{stopped}"
 
 
-def _product_operations(P: PETSc.Mat, layout: Layout) -> float:
-    """Of a product with P, by FFT on a grid twice as wide if P does not show how it multiplies."""
+def _product_operations(P: PETSc.Mat, layout: Layout, by_fft: bool) -> float:
+    """Of a product with P. If P does not show how it multiplies: by FFT on a grid twice as wide, or else as a stored
+    matrix, or in a microsecond per row, as fast multipole methods and H-matrices take."""
     known = compressed(P)
     if known is not None:
         return apply_operations(known.train)
     if P.getType() in DENSE:
         return 0.5 * float(P.getSize()[0]) ** 2
+    if not by_fft:
+        return min(0.5 * float(P.getSize()[0]) ** 2, 1e3 * P.getSize()[0])
     wide = prod(2 * n for n in layout.digits.shape)
     return wide * log2(wide)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import block_csr_matrix
+from pctt.blocks import block_csr_matrix, symmetric_shell
+from pctt.mat.entries import diagonal, given, has_entries
 from pctt.tt.train import Array
 
 
@@ -54,22 +57,90 @@ def finds_negative(X: PETSc.Mat, A: PETSc.Mat, steps: int = 12) -> bool:
     return reason < 0 and reason != PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT
 
 
-def iterations_with_the_diagonal(A: PETSc.Mat, diagonal: Array, most: int = 500) -> int:
+def iterations_with_the_diagonal(A: PETSc.Mat, scale: Array, most: int = 500) -> int:
     """About how many iterations conjugate gradients to 1e-8 take with the diagonal; `most` at most. Collective.
 
     They are extrapolated from the first six.
     """
-    probe, digits, count = 6, 8.0, len(diagonal)
-    diagonal = np.where(diagonal > 0, diagonal, 1.0)
+    probe, digits, count = 6, 8.0, len(scale)
+    scale = np.where(scale > 0, scale, 1.0)
     b = A.createVecLeft()
-    b.array_w[:] = np.random.default_rng(A.comm.rank).standard_normal(count) * np.sqrt(diagonal)
+    b.array_w[:] = np.random.default_rng(A.comm.rank).standard_normal(count) * np.sqrt(scale)
     first = A.getOwnershipRange()[0]
     rows = np.arange(count + 1)
-    D = block_csr_matrix(A.comm, count, count, rows, first + rows[:-1], diagonal.reshape(-1, 1, 1))
+    D = block_csr_matrix(A.comm, count, count, rows, first + rows[:-1], scale.reshape(-1, 1, 1))
     _, norms = _conjugate_gradients(A, D, PETSc.PC.Type.JACOBI, b, probe)
     D.destroy()
     found = float(np.log10(norms[0] / max(norms[-1], 1e-16 * norms[0])))
     return int(A.comm.tompi4py().bcast(min(most, probe * digits / max(found, probe * digits / most))))
+
+
+def null_vectors(A: PETSc.Mat, P: PETSc.Mat) -> list[Array]:
+    """This rank's parts of vectors that P takes to zero, of the null space of P or A and the constant. Collective."""
+    spaces = [one.getNullSpace() for one in (P, A)]
+    told: list[PETSc.Vec] = next((space.getVecs() for space in spaces if space.handle), [])
+    x, y = P.createVecs()
+    found = []
+    for vec in (None, *told):
+        x.set(1.0) if vec is None else vec.copy(x)
+        P.mult(x, y)
+        size = P.norm(PETSc.NormType.FROBENIUS) * x.norm()
+        if P.comm.tompi4py().bcast(0 < size < np.inf and y.norm() <= 1e-12 * size):
+            found.append(x.array_r.copy())
+    x.destroy()
+    y.destroy()
+    return found
+
+
+def has_negative_diagonal(P: PETSc.Mat) -> bool:
+    """Whether all diagonal entries are negative, as in a negative definite matrix. P has entries, or is stored."""
+    entries = diagonal(P) if has_entries(P) else P.getDiagonal().array_r
+    return bool(P.comm.tompi4py().allreduce(bool((entries < 0).all()), op=MPI.LAND))
+
+
+def negated(A: PETSc.Mat) -> PETSc.Mat:
+    """A new Mat that is -A, with what the user has said about A. If A is not stored, its products are those of A."""
+    function, kind = given(A, "entries"), A.getType().removeprefix("seq").removeprefix("mpi")
+    if function is None and kind.startswith(("aij", "baij", "sbaij", "dense")):
+        other = A.duplicate(copy=True)
+        other.scale(-1.0)
+    else:
+        x, y = A.createVecs()
+
+        def times(v: Array, out: Array) -> None:
+            x.array_w[:] = v
+            A.mult(x, y)
+            out[:] = -y.array_r
+
+        other = symmetric_shell(A.comm.tompi4py(), A.getLocalSize()[0], A.getBlockSize(), times)
+        if function is not None:
+            other.setAttr("entries", lambda i, j: -np.asarray(function(i, j)))
+    for name in ("coordinates", "grid", "key"):
+        other.setAttr(name, given(A, name))
+    return other
+
+
+def replaced_blocks(P: PETSc.Mat) -> Array | None:
+    """The diagonal blocks of a stored Mat, where some diagonal entry is zero: `without_singular`. None otherwise."""
+    zero = bool((P.getDiagonal().array_r == 0).any())
+    if not P.comm.tompi4py().allreduce(zero, op=MPI.LOR):
+        return None
+    size, here = P.getBlockSize(), P.getLocalSize()[0]
+    indptr, indices, values = P.getDiagonalBlock().getValuesCSR()
+    near = sp.csr_matrix((values, indices, indptr), shape=(here, here)).tocoo()
+    inside = near.row // size == near.col // size
+    row, column = near.row[inside], near.col[inside]
+    blocks = np.zeros((here // size, size, size))
+    blocks[row // size, row % size, column % size] = near.data[inside]
+    return without_singular(blocks)
+
+
+def without_singular(blocks: Array) -> Array:
+    """These blocks (n, bs, bs) with identities in place of singular ones, as PCJACOBI has ones in place of zeros."""
+    finite = np.isfinite(blocks).all(axis=(1, 2))
+    size = blocks.shape[1]
+    singular = np.linalg.matrix_rank(np.where(finite[:, None, None], blocks, np.eye(size))) < size
+    return np.where(singular[:, None, None], np.eye(size), blocks)
 
 
 def _conjugate_gradients(A: PETSc.Mat, M: PETSc.Mat, kind: str, b: PETSc.Vec, steps: int) -> tuple[int, Array]:

@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Optional
 
-from pctt.options import AT_LEAST_ONE, FRACTION, POSITIVE, OptionError, number, option
+from pctt.options import FRACTION, POSITIVE, number, option
 
 
 @dataclass(frozen=True)
@@ -18,20 +18,14 @@ class Options:
         check=FRACTION,
     )
     rank: str = option(
-        "auto", "cap of the ranks of matrix and inverse; auto: by counted operations up to max_rank for a matrix given "
+        "auto", "cap of the ranks of matrix and inverse; auto: by counted operations up to 100 for a matrix given "
         "by its entries, 1 (block Jacobi) for a sparse one",
         check=("auto or a whole number >= 1", lambda x: x == "auto" or (x.isdecimal() and int(x) >= 1)),
     )
-    max_rank: Optional[int] = option(
-        None, "largest rank that auto takes; none: 100", check=AT_LEAST_ONE
-    )
-    compress: str = option(
-        "als", "for sparse matrices; als: alternating least squares over the nonzeros; cross: AMEn cross (the paper)",
-        choices=("als", "cross"),
-    )
-    scaling: str = option(
-        "block", "block: by Cholesky factors of the diagonal blocks; none: the matrix as it is (the paper)",
-        choices=("block", "none"),
+    variant: str = option(
+        "own", "of sparse trains; paper: AMEn cross and no scaling; cross: only that; unscaled: only that; own: "
+        "alternating least squares over the nonzeros, scaled by Cholesky factors of the diagonal blocks",
+        choices=("own", "cross", "unscaled", "paper"),
     )
     order: str = option(
         "auto",
@@ -41,17 +35,10 @@ class Options:
         choices=("auto", "grid", "morton", "rcm", "natural"),
     )
     reuse: str = option(
-        "trains",
-        "none: compute everything anew; newton: start from cores, index sets and block pairs of the last matrix with "
-        "the same structure; steps: take its slots and cores for the next structure too; trains: also keep a whole "
-        "train, with the new matrix's scaling, while new ones are hardly better",
-        choices=("none", "newton", "steps", "trains"),
-    )
-    precision: str = option(
-        "auto",
-        "of products with the inverse; auto: single where that can do no harm (entries, eps >= 1e-5, CG or a flexible "
-        "Krylov method), else double",
-        choices=("auto", "single", "double"),
+        "none",
+        "none: each matrix gets a train of its own; cores: which starts from the cores of the last matrix; trains: a "
+        "whole train is kept, with the new matrix's scaling, while new ones are hardly better (Newton steps)",
+        choices=("none", "cores", "trains"),
     )
     fallback: str = option(
         "jacobi",
@@ -65,24 +52,31 @@ class Options:
         "take; none: as many as a solution without a train takes",
         check=POSITIVE,
     )
-    monitor: bool = option(False, "print a line per set-up")
+    max_rank: int = number(100, "largest rank that auto takes")
+    precision: str = number(
+        "auto", "of products with the inverse, single or double; auto: single where that can do no harm (entries, eps "
+        ">= single_eps, CG or a flexible Krylov method)"
+    )
     coarse: float = number(1e-2, "auto: a smaller eps asks for an accurate inverse, which a transform is not")
     pays: float = number(5e8, "operations that a train may take in any case; auto looks for none in cheaper solutions")
     part: float = number(0.25, "auto: a train may take this part of the operations of a solution with a transform")
     single_eps: float = number(1e-5, "auto: a smaller eps needs double precision, whose rounding is 1e-7 in single")
     seed: int = number(0, "of the random starts of sparse trains")
 
-    def __post_init__(self) -> None:
-        if self.automatic or self.max_rank is None:
-            return
-        raise OptionError(
-            f"-pc_tt_max_rank {self.max_rank}: has no effect with -pc_tt_rank {self.rank}; allowed is one of the two"
-        )
-
     @property
     def automatic(self) -> bool:
         """Whether the rank is chosen here."""
         return self.rank == "auto"
+
+    @property
+    def scaled(self) -> bool:
+        """Whether the diagonal blocks scale a sparse matrix."""
+        return self.variant in ("own", "cross")
+
+    @property
+    def by_cross(self) -> bool:
+        """Whether a cross compresses a sparse matrix."""
+        return self.variant in ("cross", "paper")
 
 
 @dataclass

@@ -242,6 +242,16 @@ class SlottedMatrix:
         """This rank's part (n bs,) of L^-T z."""
         return np.matmul(self.root.transpose(0, 2, 1), z.reshape(-1, self.block, 1)).ravel()
 
+    def images(self, v: Array) -> Array:
+        """This rank's part (n bs,) of L' v: a null vector of the scaled matrix for one of P."""
+        return np.linalg.solve(self.root.transpose(0, 2, 1), v.reshape(-1, self.block, 1)).ravel()
+
+    def spread(self, v: Array) -> Array:
+        """All of a vector (size bs,) in the order of the slots, from this rank's part."""
+        out = np.zeros((self.size, self.block))
+        out[self.places] = self._gathered(v.reshape(-1, self.block))
+        return out.ravel()
+
     def product(self) -> TrainProduct:
         """The product with a train of the slots, with rows in the order of the Mat."""
         slots = np.add.outer(self.places * self.block, np.arange(self.block)).ravel()

@@ -5,8 +5,8 @@ compressed into a train T (paper, section 3), and I + T is inverted as a train. 
 cores and whole trains again.
 
 Scaled by its own diagonal blocks, the matrix of the next Newton step or time step is similar to the last one. So the
-train of the last matrix is often as good as a new one, and costs nothing: it is kept. A new one is tried after 2
-set-ups, and then after twice as many each time, as long as this gains nothing.
+train of the last matrix is often as good as a new one, and costs nothing: with -pc_tt_reuse trains it is kept. A new
+one is tried after 2 set-ups, and then after twice as many each time, as long as this gains nothing.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from pctt import memory
 from pctt.blocks import symmetric_shell
 from pctt.mat.grid_train import TrainProduct
 from pctt.mat.order import Places, chosen_order
-from pctt.pc.mat import finds_negative, is_symmetric
+from pctt.pc.mat import finds_negative, is_symmetric, null_vectors
 from pctt.pc.options import Account, Options
 from pctt.pc.slots import Slots, SlottedMatrix
 from pctt.tt.cross import Cross, compress_cross
 from pctt.tt.inverse import Inverse, invert, invert_near_identity
 from pctt.tt.quantise import choose_modes
 from pctt.tt.sparse import Compression, SparseHierarchy, compress
-from pctt.tt.train import Array
+from pctt.tt.train import Array, Train, decompose, identity
 
 LEAF = 16  # least number of blocks in the first and in the last mode
 
@@ -40,10 +40,11 @@ class SparseTrain:
     slots, hierarchy : slots and block pairs of the present structure; None before a train is made for it
     tree : slots that are kept from structure to structure
     rank : cap of the ranks
-    failure : why a train that was asked for is not used; it is not tried again before the next structure
+    failure : why a train that was asked for is not used; the next matrix is tried again. With reuse the intervals
+        between trials double until the next structure
     """
 
-    note, base = "", "block Jacobi"
+    note, base, promise = "", "block Jacobi", None
     single_pays = False
     _product: TrainProduct  # of the inverse in use
 
@@ -51,6 +52,8 @@ class SparseTrain:
         self.comm, self.options, self.account = comm, options, account
         self.rank = 1 if options.automatic else int(options.rank)
         self._block = 0  # block size of the last structure
+        self.symmetric, self.failure = True, ""
+        self._pause = self._waits = 0  # set-ups without a trial after the last refusal, and those that are left of them
         self._forget_trains()
 
     def _forget_structure(self) -> None:
@@ -69,18 +72,25 @@ class SparseTrain:
         """Begin a new structure; ValueError on all ranks if it lacks what the order needs."""
         chosen_order(self.options.order, places, "-pc_tt_order", stored=True)
         self.places, self.failure = places, ""
+        self._pause = self._waits = 0
         self._forget_structure()
-        if self.options.reuse not in ("steps", "trains") or P.getBlockSize() != self._block:
+        if self.options.reuse == "none" or P.getBlockSize() != self._block:
             self._forget_trains()
         self._block = P.getBlockSize()
-        self.symmetric = is_symmetric(P)
 
     def make(self, A: PETSc.Mat, P: PETSc.Mat) -> bool:
         """Keep the train or make a new one; False if there is none, and `failure` says why."""
-        if self.rank == 1 or self.failure:
+        if self.rank == 1:
             return False
+        if self.failure and self._waits > 0:
+            self._waits -= 1
+            return False
+        self.failure = ""
+        if not np.isfinite(P.norm(PETSc.NormType.FROBENIUS)) and not self._all(_is_finite(P)):  # a norm may overflow
+            return self._refuse("the matrix has entries that are NaN or infinite")
+        self.symmetric = is_symmetric(P)
         if self.options.reuse == "none":
-            self._forget_trains()
+            self.compression = self.inverse = self._opening = None
         first = self.slots is None
         if first:
             # a first set-up takes ten times the memory of the entries; measured at 142,000 contacts
@@ -95,7 +105,7 @@ class SparseTrain:
         if kept is not None and self._age < self._trial:
             self._use(kept)
             self.account.kept += 1
-        elif not self._try_new(P, slots, kept):
+        elif not self._try_new(A, P, slots, kept):
             return False
         if first:
             self._opening = self.inverse
@@ -108,15 +118,13 @@ class SparseTrain:
             self._forget_trains()
         if self.tree is None:
             self.tree = Slots(P, self.places, LEAF, self.options.order)
-        slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaling == "block")
+        slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaled)
         self._product = slots.product()
         return slots
 
-    def _try_new(self, P: PETSc.Mat, slots: SlottedMatrix, kept: Inverse | None) -> bool:
+    def _try_new(self, A: PETSc.Mat, P: PETSc.Mat, slots: SlottedMatrix, kept: Inverse | None) -> bool:
         """Make a train for P and use it, or use the kept train if it is as good; False if no train is positive."""
         csr = P.getValuesCSR()
-        if not self._all(bool(np.isfinite(csr[2]).all())):
-            return self._refuse("the matrix has entries that are no numbers")
         if self.hierarchy is None or not slots.lists(csr):
             with PETSc.Log.Event("TTBuild"):
                 slots.list_blocks(csr)
@@ -129,39 +137,46 @@ class SparseTrain:
         with PETSc.Log.Event("TTCompress"):
             self.compression = self._compress(warm)
         with PETSc.Log.Event("TTInvert"):
-            new = on_first(self.comm, lambda: self._invert(warm))
+            null = [slots.spread(slots.images(v)) for v in null_vectors(A, P)]
+            new = on_first(self.comm, lambda: self._invert(warm, null))
             self._use(new)
             positive = self._is_positive(P)
         self.account.reused += warm
-        if kept is None:
-            self._age, self._trial = 0, 2
-            return positive or self._refuse(f"the inverse of rank {self.rank} is not positive")
-        news = self._left(P, slots) if positive else np.inf
-        self._use(kept)
-        olds = self._left(P, slots)
-        if not news * 1.1 >= olds:  # it gains 10 %; True if the kept train leaves no number
+        if not positive and kept is None:
+            return self._refuse(f"the inverse of rank {self.rank} is not positive")
+        if kept is not None:
+            news = self._left(P, slots) if positive else np.inf
+            self._use(kept)
+            if news * 1.1 >= self._left(P, slots):  # it gains less than 10 %; False if the kept train leaves no number
+                self._trial = 2 * self._age + 1
+                self.account.kept += 1
+                return True
             self._use(new)
-            self._age, self._trial = 0, 2
-        else:
-            self._trial = 2 * self._age + 1
-            self.account.kept += 1
+        self._age, self._trial = 0, 2
         return True
 
     def _compress(self, warm: bool) -> Compression | Cross:
         assert self.hierarchy is not None
         eps, rng = self.options.eps, np.random.default_rng(self.options.seed)
         last = self.compression if warm else None
-        if self.options.compress == "cross":
+        if self.options.by_cross:
             assert last is None or isinstance(last, Cross)
             return compress_cross(self.hierarchy, self.rank, eps, last, rng=rng)
         return compress(self.hierarchy, self.rank, eps, last.train if last else None, rng=rng)
 
-    def _invert(self, warm: bool) -> Inverse:
+    def _invert(self, warm: bool, null: list[Array]) -> Inverse:
+        """The inverse of the train, plus the projections on these vectors of its null space, which would spoil it."""
         assert self.compression is not None
+        train = self.compression.train
+        if null:
+            unit = 1.0 if self.options.scaled else abs(train.inner(identity(train.rows))) / np.prod(train.rows)
+            for v in null:
+                train = train + float(unit) * _projection(v, train.rows)
+            train = train.round(0.1 * self.options.eps)
         start = self.inverse.applied if warm and self.inverse is not None else None
-        method = invert_near_identity if self.options.scaling == "block" else invert  # block scaling has unit blocks
+        method = invert_near_identity if self.options.scaled else invert  # block scaling has unit blocks
         rng = np.random.default_rng(self.options.seed)
-        return method(self.compression.train, self.rank, start, eps=self.options.eps, rng=rng)
+        return method(train, self.rank, start, eps=self.options.eps, rng=rng)
 
     def _is_positive(self, P: PETSc.Mat) -> bool:
         """Whether the train in use is positive, as far as a test shows."""
@@ -188,7 +203,13 @@ class SparseTrain:
         self.account.fall_back(why)
         self.failure = why
         self.compression = self.inverse = self._opening = None
+        self._wait()
         return False
+
+    def _wait(self) -> None:
+        """Try no train for the next matrices of a sequence of similar ones, each time for twice as many."""
+        if self.options.reuse != "none":
+            self._pause = self._waits = 2 * self._pause + 1
 
     def _all(self, here: bool) -> bool:
         return bool(self.comm.allreduce(here, op=MPI.LAND))
@@ -217,11 +238,12 @@ class SparseTrain:
         return self._product.flops + 4 * self.slots.root.size
 
     def distrust(self, why: str) -> None:
-        """A solve failed: the next set-up tries another train, or none if this one was new."""
+        """A solve failed: the next set-up tries another train; with reuse a later one, if this one was new."""
         if self._age:
             self._trial = 0
         else:
             self.failure = why
+            self._wait()
 
     def times(self, x: Array) -> Array:
         """This rank's part of L^-T X L^-1 x, from its part of x."""
@@ -234,6 +256,13 @@ class SparseTrain:
         product = self._product(x)
         return x + product if self.inverse.identity else product
 
+    @property
+    def left(self) -> float:
+        """What the trains leave of the matrix or of the residual, the larger part; 0 without trains."""
+        if self.compression is None or self.inverse is None:
+            return 0.0
+        return max(self.compression.error, self.inverse.residual)
+
     def words(self) -> str:
         """Ranks, errors and sizes."""
         if self.inverse is None or self.compression is None:
@@ -241,7 +270,20 @@ class SparseTrain:
         T, X = self.compression.train, self.inverse.applied
         form = "I + Z" if self.inverse.identity else "X"
         return (
-            f"scaling {self.options.scaling}, modes {'x'.join(map(str, T.rows))}, matrix ranks {T.ranks} error "
-            f"{self.compression.error:.2g}, inverse {form} ranks {X.ranks} residual {self.inverse.residual:.2g}, "
+            f"{'scaled' if self.options.scaled else 'not scaled'}, modes {'x'.join(map(str, T.rows))}, "
+            f"matrix ranks {T.ranks} error {self.compression.error:.2g}, "
+            f"inverse {form} ranks {X.ranks} residual {self.inverse.residual:.2g}, "
             f"{X.storage} numbers"
         )
+
+
+def _is_finite(P: PETSc.Mat) -> bool:
+    """Whether the entries of this rank's rows are numbers."""
+    return bool(np.isfinite(P.getValuesCSR()[2]).all())
+
+
+def _projection(v: Array, modes: tuple[int, ...]) -> Train:
+    """v v' / v'v as a train, with an error of 1e-3."""
+    column = decompose(v / np.linalg.norm(v), 1e-3, modes=modes)
+    matrix = Train([core[:, :, None] for core in column.cores])
+    return matrix @ matrix.T

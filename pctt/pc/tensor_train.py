@@ -11,15 +11,18 @@ from __future__ import annotations
 import time
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import block_diagonal
+from pctt.blocks import block_diagonal, diagonal_matrix
 from pctt.mat.entries import diagonal_blocks, has_entries
 from pctt.mat.order import Places, places_of
 from pctt.options import describe, read
 from pctt.pc.entries_train import EntriesTrain
+from pctt.pc.mat import has_negative_diagonal, negated, replaced_blocks, without_singular
 from pctt.pc.options import Account, Options
 from pctt.pc.sparse_train import SparseTrain
+from pctt.pc.watch import Watch
 from pctt.petsc import Context, given_options, on_coordinates, set_failed, warn
 
 NOT_SYMMETRIC = "the matrix is not symmetric, so a train for its inverse may be useless"
@@ -56,14 +59,17 @@ class TensorTrain(Context):
         self.account = Account()
         self.P: PETSc.Mat | None = None  # the matrix, or a copy of it in AIJ; None if it has no rows
         self.rank = 1
+        self.sign = 1.0  # -1: the train is that of minus the matrix
         self.failed = False  # whether there is no preconditioner, by -pc_tt_fallback none
         self.places = Places()
         self._structure: tuple | None = None
         self._copy: list[PETSc.Mat] = []  # P, if it is a copy
         self._own: list[PETSc.Object] = []  # block Jacobi and its matrix
         self._warned: set[str] = set()
+        self._refused = False  # whether the last set-up failed
         self._points: np.ndarray | None = None
         self._last_precision: type = np.float64  # of the last solve
+        self._watch: Watch | None = None  # of the solve that is going on
         self._on_coordinates = on_coordinates(pc, self._take_points)
 
     def destroy(self, pc: PETSc.PC) -> None:
@@ -121,17 +127,28 @@ class TensorTrain(Context):
         kind = P.getType().removeprefix("seq").removeprefix("mpi")
         if kind.startswith(("aij", "baij")):
             return P
-        if not kind.startswith(("sbaij", "dense")):
-            allowed = "allowed are aij, baij, sbaij, dense"
-            raise ValueError(f"{self.name}: a Mat of type {P.getType()} has no entries to read; {allowed}")
-        sparse = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
-        if sparse.getBlockSize() != P.getBlockSize():
-            sparse.setBlockSize(P.getBlockSize())
-        for attribute in ("coordinates", "grid", "key"):
-            sparse.setAttr(attribute, P.getAttr(attribute))
+        if kind.startswith(("sbaij", "dense")):
+            sparse = P.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
+            if sparse.getBlockSize() != P.getBlockSize():
+                sparse.setBlockSize(P.getBlockSize())
+            for attribute in ("coordinates", "grid", "key"):
+                sparse.setAttr(attribute, P.getAttr(attribute))
+        else:
+            sparse = self._diagonal_of(P)
         _destroy(self._copy)
         self._copy = [sparse]
         return sparse
+
+    def _diagonal_of(self, P: PETSc.Mat) -> PETSc.Mat:
+        """The diagonal of a Mat without entries to read; ValueError on all ranks if it has none."""
+        what = f"a Mat of type {P.getType()} has no entries to read"
+        try:
+            diagonal = P.getDiagonal()
+        except PETSc.Error:
+            allowed = "aij, baij, sbaij, dense, any Mat with the attribute entries, or at least MatGetDiagonal"
+            raise ValueError(f"{self.name}: {what}; allowed are {allowed}") from None
+        self._warn(P.comm.tompi4py(), f"{what}: its diagonal is used")
+        return diagonal_matrix(diagonal)
 
     def _begin(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Take what depends on the structure of P only."""
@@ -146,39 +163,47 @@ class TensorTrain(Context):
         self.made = made
         made.begin(P, self.places)
 
-    def _warn(self, words: str) -> None:
-        """Warn, once in the life of this preconditioner; collective."""
-        if words not in self._warned:
-            self._warned.add(words)
-            warn(self.comm, f"{self.name}: {words}")
+    def _warn(self, comm: MPI.Comm, words: str, kind: str = "") -> None:
+        """Warn, once in the life of this preconditioner; or once of this kind. Collective.
+
+        Python's filter shows a text once, so it names the options' prefix, which tells the solvers of a program apart.
+        """
+        if (kind or words) not in self._warned:
+            self._warned.add(kind or words)
+            warn(comm, f"{self.name}{f' of {self.prefix}' if self.prefix else ''}: {words}")
 
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Make a train or what the rule prefers to it; if this fails, fall back."""
-        start, made = time.perf_counter(), self.made
-        self.rank = made.rank if made.make(pc.getOperators()[0], P) else 1
+        start, made, A = time.perf_counter(), self.made, pc.getOperators()[0]
+        self.sign = -1.0 if made.rank > 1 and has_negative_diagonal(P) else 1.0
+        operators = [A, P] if self.sign > 0 else [negated(A), negated(P)]
+        self.rank = made.rank if made.make(*operators) else 1
+        if self.sign < 0:
+            _destroy(operators)
         if not made.symmetric:
-            self._warn(NOT_SYMMETRIC)
+            self._warn(self.comm, NOT_SYMMETRIC)
         self.failed = bool(made.failure) and self.options.fallback == "none"
-        if made.failure:
+        if made.failure and not self._refused:
             takes_over = "there is no preconditioner" if self.failed else f"{made.base} takes over"
             sparse = isinstance(made, SparseTrain)
             lost = sparse and self.places.source == "nothing" and self.options.order == "auto"
-            words = [f"{made.failure}: {takes_over}", *[NOWHERE] * lost, *[FASTER] * sparse]
-            self._warn("; ".join(words))
+            reasons = [f"{made.failure}: {takes_over}", *[NOWHERE] * lost, *[FASTER] * sparse]
+            self._warn(self.comm, "; ".join(reasons))
+        self._refused = bool(made.failure)
         if self.rank == 1 and not self.failed:
             self._make_block_jacobi(P)
         set_failed(pc, self.failed)
         self._made_in = time.perf_counter() - start
         self.account.setups += 1
         self.account.setup_s += self._made_in
-        if isinstance(made, EntriesTrain) and made.inverse is not None and made.inverse.residual > 0.5:
-            self._warn(f"the inverse of rank {self.rank} leaves {made.inverse.residual:.2g} of the residual")
-        if self.options.monitor:
-            PETSc.Sys.Print(f"  {self.name}: {self._line()}", comm=P.comm)
+        left = made.left if self.rank > 1 else 0.0
+        if left > 0.5:
+            words = f"the train of rank {self.rank} leaves {left:.2g} of the matrix or of the residual"
+            self._warn(self.comm, words, "leaves")
 
     def _make_block_jacobi(self, P: PETSc.Mat) -> None:
         _destroy(self._own)
-        diagonal = block_diagonal(P, diagonal_blocks(P) if has_entries(P) else None)
+        diagonal = block_diagonal(P, without_singular(diagonal_blocks(P)) if has_entries(P) else replaced_blocks(P))
         self._jacobi = PETSc.PC().create(P.comm)
         self._jacobi.setType(PETSc.PC.Type.PBJACOBI)
         self._jacobi.setOperators(diagonal)
@@ -193,14 +218,32 @@ class TensorTrain(Context):
             self.setUp(pc)
         if self.P is None:
             return
+        if self._watch is not None:
+            self._watch.count()
         if self.failed:
             y.set(np.inf)
         elif self.rank == 1:
             self._jacobi.apply(x, y)
         else:
             with PETSc.Log.Event("TTApply"):
-                y.array_w[:] = self.made.times(x.array_r)
+                y.array_w[:] = self.sign * self.made.times(x.array_r)
                 PETSc.Log.logFlops(self.made.flops)
+
+    def matApply(self, pc: PETSc.PC, X: PETSc.Mat, Y: PETSc.Mat) -> None:
+        """Y = M X for dense Mats; block Jacobi and trains of sparse matrices take one column after the other."""
+        if self._structure is None:
+            self.setUp(pc)
+        x, y = X.getDenseArray(readonly=True), Y.getDenseArray()
+        if self.P is not None and self.rank > 1 and not self.failed and isinstance(self.made, EntriesTrain):
+            with PETSc.Log.Event("TTApply"):
+                y[:] = self.sign * self.made.times(x.T).T
+                PETSc.Log.logFlops(self.made.flops * x.shape[1])
+            return
+        for k in range(X.getSize()[1]):
+            one, other = X.getDenseColumnVec(k, "r"), Y.getDenseColumnVec(k, "w")
+            self.apply(pc, one, other)
+            X.restoreDenseColumnVec(k, "r")
+            Y.restoreDenseColumnVec(k, "w")
 
     def applyTranspose(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M' x; trains are symmetric, blocks of a matrix may be not."""
@@ -215,6 +258,8 @@ class TensorTrain(Context):
         if self.P is not None and self.rank > 1:
             self._last_precision = self._precision(self._is_unharmed(ksp))
             self.made.use(self._last_precision)
+        promise = None if self.P is None or self.failed else self.made.promise
+        self._watch = Watch(ksp, b, x, promise) if promise is not None and Watch.can(ksp, pc) else None
 
     @staticmethod
     def _is_unharmed(ksp: PETSc.KSP) -> bool:
@@ -235,6 +280,12 @@ class TensorTrain(Context):
             return
         if self.rank > 1:  # whoever calls next may be another method
             self.made.use(self._precision(unharmed=False))
+        if self._watch is not None:
+            watch, self._watch = self._watch, None
+            watch.end()
+            if watch.solution is not None and ksp.getConvergedReason() < 0:
+                self._leave(watch, ksp, b, x)
+                return
         reason = ksp.getConvergedReason()
         if self.rank > 1 and reason < 0:
             used = self._used()
@@ -244,7 +295,7 @@ class TensorTrain(Context):
                 again = self.options.fallback == "jacobi"
                 self.account.fall_back(f"{what}, solved again with block Jacobi" if again else what)
                 self.made.distrust(self.account.last)
-                self._warn(self.account.last)
+                self._warn(self.comm, self.account.last)
                 if again:
                     self._solve_again(ksp, b, x)
             elif ksp.getType() not in ("preonly", "richardson"):
@@ -252,23 +303,41 @@ class TensorTrain(Context):
                 self.made.distrust(self.account.last)
         self.account.used[self._used()] += 1
 
-    def _solve_again(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """Solve from zero by the same method with block Jacobi, which other solves with this matrix then use too.
+    def _leave(self, watch: Watch, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Hand the solution of conjugate gradients alone to the KSP; other solves with this matrix then have no
+        preconditioner."""
+        used, products = self._used(), watch.products
+        why = f"conjugate gradients alone take {products} iterations, {used} has not done in as many products"
+        assert isinstance(self.made, EntriesTrain)
+        self.made.leave(why)
+        self.rank = self.made.rank
+        x.array_w[:] = watch.solution
+        self._go_on(ksp, b, x, PETSc.PC.Type.NONE, ksp.getOperators()[1], nonzero=True)
+        self.account.used[self._used()] += 1
 
-        The KSP gets the outcome.
-        """
+    def _solve_again(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """Solve from zero by the same method with block Jacobi, which other solves with this matrix then use too."""
         self.rank = 1
         self._make_block_jacobi(self.P)
+        self._go_on(ksp, b, x, PETSc.PC.Type.PBJACOBI, self._own[1])
+
+    @staticmethod
+    def _go_on(
+        ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec, kind: str, P: PETSc.Mat, nonzero: bool = False
+    ) -> None:  # fmt: skip
+        """Solve by the same method with another preconditioner, from zero or from x. The KSP gets the outcome."""
         again = PETSc.KSP().create(ksp.comm)
         again.setType(ksp.getType())
         again.setPCSide(ksp.getPCSide())
         again.setNormType(ksp.getNormType())
         rtol, atol, divtol, max_it = ksp.getTolerances()
         again.setTolerances(rtol, atol, divtol, max_it)
-        again.pc.setType(PETSc.PC.Type.PBJACOBI)
-        again.setOperators(ksp.getOperators()[0], self._own[1])
+        again.setInitialGuessNonzero(nonzero)
+        again.pc.setType(kind)
+        again.setOperators(ksp.getOperators()[0], P)
         again.solve(b, x)
         ksp.setIterationNumber(ksp.getIterationNumber() + again.getIterationNumber())
+        ksp.setResidualNorm(again.getResidualNorm())
         ksp.setConvergedReason(again.getConvergedReason())
         again.destroy()
 
@@ -290,6 +359,7 @@ class TensorTrain(Context):
             f"rows ordered by {self.places.source}",
             *([] if symmetric else [NOT_SYMMETRIC]),
             *(f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()),
+            *(["the next matrix is tried again"] if a.fallbacks else []),
         ]
 
     def what(self) -> str:
@@ -308,7 +378,8 @@ class TensorTrain(Context):
         if self.P is None:
             return "made for no system yet"
         if self.rank == 1:
-            note = f", because {self.made.note}" if self.made.note else ""
+            why = self.made.note or self.made.failure
+            note = f", because {why}" if why else ""
             faster = f"; {FASTER}" if isinstance(self.made, SparseTrain) else ""
             return f"rank 1 (block Jacobi{note}), set up in {self._made_in:.2e} s{faster}"
         digits = "single" if self._last_precision is np.float32 and self.made.inverse is not None else "double"

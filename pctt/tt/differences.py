@@ -1,84 +1,263 @@
 """Fast transforms as preconditioners of matrices whose entries depend on differences.
 
-A(x, y) = a(x - y) for the points of a grid (a Toeplitz matrix on each axis). Of all matrices that a cosine or a sine
-transform Q diagonalises, the nearest one to A in Frobenius' norm has the eigenvalues diag(Q A Q'). They are Rayleigh
-quotients of A, so this matrix is positive definite if A is. The quotients of all basis vectors of an axis are
-transforms of the weighted differences: with v_k(i) v_k(j) = (cos t (i - j) +- cos t (i + j + 1)) / n, t = pi k / n, and
-the sum of the second cosines over all pairs of difference s, which is -sin(t s) / sin(t),
+A(x, y) = a(x - y) for the points of a grid (a Toeplitz matrix on each axis); a(s) is a number, or a block of b x b
+numbers if a point has b unknowns. Of all matrices that a transform Q diagonalises (up to blocks), the nearest one to A
+in Frobenius' norm has the eigenvalues diag(Q A Q'). They are Rayleigh quotients of A, so this matrix is positive
+definite if A is. For a cosine or a sine transform the quotients of all basis vectors of an axis are transforms of the
+weighted differences: with v_k(i) v_k(j) = (cos t (i - j) +- cos t (i + j + 1)) / n, t = pi k / n, and the sum of the
+second cosines over all pairs of difference s, which is -sin(t s) / sin(t),
 
     lambda_k = 1/n sum_s a(s) ((n - |s|) cos t s  -+  sin t |s| / sin t).
 
-(For circulants: T. Chan, SIAM J. Sci. Stat. Comput. 9, 1988; for the cosine transform R. Chan, T. Chan & Wong, 1999.) A
-cosine transform reflects at the boundary of the grid, where a circulant continues at the opposite side; a sine
-transform reflects with the other sign. So errors at the boundary have opposite signs, and a mean of both inverses is
-often nearer to that of A.
+(R. Chan, T. Chan & Wong, 1999; for circulants T. Chan, SIAM J. Sci. Stat. Comput. 9, 1988.) A cosine transform reflects
+at the boundary of the grid, where a circulant continues at the opposite side; a sine transform reflects with the other
+sign. So errors at the boundary have opposite signs, and a mean of both inverses is often nearer to that of A. Both see
+only the mean of a over the signs of the coordinates. If A differs much from it (rotated anisotropy), circulants are
+better, and so is a part of the inverse of the circulant on a grid twice as wide that has A as a part.
+
+Which of them is best, if any, a few solutions on parts of the grid show (`choose`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import product as signs_of
-from math import prod
+from math import inf, prod
 
 import numpy as np
 from scipy import fft
 
+from pctt.tt.conjugate import PATIENCE, ConjugateGradients, Promise, iterations, race
 from pctt.tt.train import Array
 
-KINDS = ("cosine", "sine")
-SHARES = (1.0, 0.75, 0.5, 0.0)  # of the cosine transform, that are tried
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
-TRIAL_ITS = 100  # most iterations of a trial by conjugate gradients
+POINTS = 4096  # most points of a part of the grid, on which solutions are tried; with 1024 two of 26 choices were bad
+SLACK = 1.5  # a preconditioner that costs so many times more than another one on a part is not tried further
+MOST = 400.0  # products that a trial may cost
+
+#: What is tried: the transforms of which the mean of the inverses is taken, and their shares.
+Kind = tuple[tuple[str, float], ...]
+NOTHING: Kind = ()
+BLOCK_DIAGONAL: Kind = (("block diagonal", 1.0),)
+CIRCULANT: Kind = (("circulant", 1.0),)
+CANDIDATES: tuple[Kind, ...] = (
+    NOTHING, BLOCK_DIAGONAL, CIRCULANT, (("cosine", 1.0),),
+    (("cosine", 0.75), ("sine", 0.25)), (("cosine", 0.5), ("sine", 0.5)), (("sine", 1.0),), (("embedding", 1.0),),
+)  # fmt: skip
+#: The cost of an application; that of a product with A is 1.
+COSTS = {"block diagonal": 0.0, "circulant": 0.25, "cosine": 0.25, "sine": 0.25, "embedding": 1.0}
+WORDS = {
+    "block diagonal": "block Jacobi", "circulant": "circulant", "cosine": "cosine transform",
+    "sine": "sine transform", "embedding": "circulant embedding",
+}  # fmt: skip
 
 
-class FastTransform:
-    """A mean of the inverses of the nearest matrices to A that a cosine and a sine transform diagonalise.
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """The function a(s) of a matrix with b unknowns a point.
 
-    differences : (n_1, ..., n_D) the means of a(s) over the signs of the coordinates of s
-    share : of the cosine transform in the mean, the rest is that of the sine transform
+    shape : (n_1, ..., n_D) of the grid
+    values : (n_1, ..., n_D, b, b), if all signs of coordinates give the same a; otherwise
+        (2 n_1 - 1, ..., 2 n_D - 1, b, b), negative differences from the end
+
+    >>> a = Differences.of_even(0.5 ** np.arange(4.0))
+    >>> a.times(np.array([1.0, 0, 0, 0])).round(6)
+    array([1.   , 0.5  , 0.25 , 0.125])
+    """
+
+    shape: tuple[int, ...]
+    values: Array
+
+    @classmethod
+    def of_even(cls, values: Array) -> Differences:
+        """For numbers a(s) (n_1, ..., n_D), which are the same for all signs of coordinates of s."""
+        return cls(values.shape, values[..., None, None])
+
+    @property
+    def block(self) -> int:
+        return self.values.shape[-1]
+
+    @property
+    def even(self) -> bool:
+        return self.values.shape[:-2] == self.shape
+
+    @property
+    def transposed(self) -> Differences:
+        """Those of the transposed matrix, a(-s)'."""
+        opposite = self.values if self.even else self.values[np.ix_(*[-np.arange(m) for m in self.values.shape[:-2]])]
+        return Differences(self.shape, np.swapaxes(opposite, -1, -2))
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the matrix is, up to rounding."""
+        return self._is_near(self.transposed.values)
+
+    def _is_near(self, values: Array) -> bool:
+        return bool(np.abs(values - self.values).max() <= 1e-12 * np.abs(self.values).max())
+
+    def compact(self) -> Differences:
+        """The same, with the values of all signs in one if they are equal up to rounding."""
+        folded = Differences(self.shape, self.values[tuple(map(slice, self.shape))])
+        signed = [np.concatenate([np.arange(n), np.arange(1 - n, 0)]) for n in self.shape]
+        return folded if not self.even and self._is_near(folded.at(signed)) else self
+
+    def at(self, offsets: Sequence[Array]) -> Array:
+        """a at all combinations of these differences along the axes."""
+        return self.values[np.ix_(*[np.abs(s) if self.even else s for s in offsets])]
+
+    def part(self, counts: Sequence[int], strides: Sequence[int]) -> Differences:
+        """Those of so many points along each axis, with these distances."""
+        offsets = []
+        for count, stride in zip(counts, strides):
+            s = np.arange(count)
+            offsets.append(stride * (s if self.even else np.concatenate([s, s[1:] - count])))
+        return Differences(tuple(counts), self.at(offsets))
+
+    def _along(self, axis: int, values: Array) -> tuple[Array, Array, Array]:
+        """a(s) and a(s - n) for s = 0, ..., n - 1 along an axis, which comes first, and s / n of the same dimension.
+
+        a(-n) is any number.
+        """
+        n = self.shape[axis]
+        values = np.moveaxis(values, axis, 0)
+        back = np.minimum(n - np.arange(n), n - 1) if self.even else np.arange(n) - n
+        return values[:n], values[back], (np.arange(n) / n).reshape(-1, *[1] * (values.ndim - 1))
+
+    def circulant(self) -> Array:
+        """The differences (n_1, ..., n_D, b, b) of the nearest circulant."""
+        values = self.values
+        for axis in range(len(self.shape)):
+            here, back, part = self._along(axis, values)
+            values = np.moveaxis((1 - part) * here + part * back, 0, axis)
+        return values
+
+    @property
+    def periodic(self) -> list[bool]:
+        """For each axis, whether a(s) = a(s - n) up to rounding. If all axes are periodic, A is a circulant."""
+        enough, found = 1e-12 * np.abs(self.values).max(), []
+        for axis in range(len(self.shape)):
+            here, back, _ = self._along(axis, self.values)
+            found.append(bool(np.abs(here - back)[1:].max(initial=0.0) <= enough))
+        return found
+
+    def means(self) -> Array:
+        """The means (n_1, ..., n_D, b, b) over the signs of the coordinates."""
+        values = self.values
+        if not self.even:
+            for axis, n in enumerate(self.shape):
+                s = np.arange(n)
+                values = np.moveaxis(values, axis, 0)
+                values = np.moveaxis(0.5 * (values[s] + values[-s]), 0, axis)
+        return values
+
+    def wide(self) -> Array:
+        """The differences (m_1, ..., m_D, b, b) of a circulant on a wider grid that has A as a part."""
+        widths = _widths(self.shape)
+        offsets = []
+        for n, m in zip(self.shape, widths):
+            s = np.arange(m)
+            offsets.append(np.where(s < n, s, np.where(s > m - n, s - m, 0)))
+        values = self.at(offsets)
+        for axis, (n, m) in enumerate(zip(self.shape, widths)):
+            np.moveaxis(values, axis, 0)[n : m - n + 1] = 0.0
+        return values
+
+    @property
+    def times(self) -> Callable[[Array], Array]:
+        """The product with A by FFT, for vectors (n_1 ... n_D b,) or several of them (k, n_1 ... n_D b)."""
+        spectrum = fft.rfftn(self.wide(), axes=range(len(self.shape)))
+        if self.even and self.block == 1:
+            spectrum = spectrum.real.copy()
+        return lambda x: _transformed("embedding", self.shape, spectrum, x)
+
+
+def _widths(shape: tuple[int, ...]) -> list[int]:
+    return [fft.next_fast_len(2 * n - 1, real=True) for n in shape]
+
+
+def _transformed(kind: str, shape: tuple[int, ...], factor: Array, x: Array) -> Array:
+    """Q' F Q x for vectors x (..., n_1 ... n_D b); F has the blocks ``factor``, and Q is the transform of this kind."""
+    block, axes = factor.shape[-1], range(-len(shape) - 1, -1)
+    y = x.reshape(*x.shape[:-1], *shape, block)
+    if kind == "cosine":
+        y = fft.idctn(_multiplied(factor, fft.dctn(y, axes=axes)), axes=axes, overwrite_x=True)
+    elif kind == "sine":
+        y = fft.idstn(_multiplied(factor, fft.dstn(y, axes=axes)), axes=axes, overwrite_x=True)
+    elif kind == "block diagonal":
+        y = _multiplied(factor, y)
+    else:
+        sizes = list(shape) if kind == "circulant" else _widths(shape)
+        y = fft.irfftn(_multiplied(factor, fft.rfftn(y, sizes, axes=axes)), sizes, axes=axes, overwrite_x=True)
+        y = y[(..., *map(slice, shape), slice(None))]
+    return y.reshape(x.shape)
+
+
+def _multiplied(factor: Array, y: Array) -> Array:
+    if factor.shape[-1] == 1:
+        return factor[..., 0] * y
+    return np.einsum("...ij,...j->...i", factor, y)
+
+
+class FastInverse:
+    """A mean of the inverses of the nearest matrices to A that fast transforms diagonalise.
+
+    a : the matrix A
+    kind : of the mean, one of CANDIDATES
 
     positive : whether all eigenvalues are positive; if not, neither is A
+    name : in words
 
-    >>> a = 0.3 ** np.arange(6.0)
-    >>> A = a[abs(np.subtract.outer(range(6), range(6)))]
-    >>> x = FastTransform(a).solve(A @ np.ones(6))
+    >>> a = Differences.of_even(0.3 ** np.arange(6.0))
+    >>> x = FastInverse(a, (("cosine", 1.0),)).solve(a.times(np.ones(6)))
     >>> bool(abs(x - 1).max() < 0.25)
     True
     """
 
-    def __init__(self, differences: Array, share: float = 1.0) -> None:
-        self.share, self.shape = share, differences.shape
-        self.positive = True
-        self._inverses: list[tuple[str, Array]] = []
-        for kind, part in zip(KINDS, (share, 1 - share)):
-            if part == 0:
-                continue
-            values = eigenvalues(differences, kind)
-            largest = float(values.max())
-            self.positive &= bool(largest > 0 and values.min() > -FLOOR * largest)
-            self._inverses.append((kind, part / np.maximum(values, FLOOR * abs(largest) or 1.0)))
-
-    @property
-    def name(self) -> str:
-        return " and ".join(kind for kind, _ in self._inverses) + " transform"
+    def __init__(self, a: Differences, kind: Kind) -> None:
+        self.kind, self.shape, self.block, self.positive = kind, a.shape, a.block, True
+        self.each = sum(COSTS[transform] for transform, _ in kind)
+        self.name = " and ".join(WORDS[transform] for transform, _ in kind) or "no preconditioner"
+        if len(kind) == 2:
+            self.name = "cosine and sine transform"
+        self._factors: list[tuple[str, Array]] = []
+        for transform, share in kind:
+            values, least = eigenvalues(a, transform)
+            inverse, positive = _inverse(values, least)
+            self.positive &= positive
+            self._factors.append((transform, share * inverse))
 
     def solve(self, x: Array) -> Array:
-        """The product of the mean of the inverses with x (n_1 ... n_D,)."""
-        out = np.zeros(self.shape)
-        for kind, inverse in self._inverses:
-            forward, backward = (fft.dctn, fft.idctn) if kind == "cosine" else (fft.dstn, fft.idstn)
-            spectrum = forward(x.reshape(self.shape))
-            spectrum *= inverse
-            out += backward(spectrum, overwrite_x=True)
-        return out.ravel()
+        """The product of the mean of the inverses with x (..., n_1 ... n_D b)."""
+        if not self._factors:
+            return x.copy()
+        (kind, factor), *more = self._factors
+        out = _transformed(kind, self.shape, factor, x)
+        for kind, factor in more:
+            out += _transformed(kind, self.shape, factor, x)
+        return out
 
 
-def eigenvalues(differences: Array, kind: str) -> Array:
-    """diag(Q A Q'), of the shape of the differences."""
-    values = differences
-    for axis in range(differences.ndim):
-        values = np.moveaxis(_along_last(np.moveaxis(values, axis, -1), kind), -1, axis)
-    return values
+def eigenvalues(a: Differences, transform: str) -> tuple[Array, float | None]:
+    """The blocks (..., b, b) of Q A Q' on its diagonal, and a bound below which they count as this bound, or None.
+
+    A circulant on a wider grid need not be positive if A is. Its bound is the least eigenvalue of the nearest
+    circulant.
+    """
+    axes = range(len(a.shape))
+    if transform == "block diagonal":
+        return a.values[(slice(1),) * len(a.shape)], None
+    if transform in ("cosine", "sine"):
+        values = a.means()
+        for axis in axes:
+            values = np.moveaxis(_along_last(np.moveaxis(values, axis, -1), transform), -1, axis)
+        return values, None
+    values = fft.rfftn(a.circulant(), axes=axes)
+    bound = None
+    if transform == "embedding":
+        bound = float(np.linalg.eigvalsh(values).min()) if a.block > 1 else float(values.real.min())
+        values = fft.rfftn(a.wide(), axes=axes)
+    return (values.real if a.block == 1 else values), bound
 
 
 def _along_last(a: Array, kind: str) -> Array:
@@ -92,67 +271,118 @@ def _along_last(a: Array, kind: str) -> Array:
     return (even - odd)[..., :n] if kind == "cosine" else (even + odd)[..., 1:]
 
 
-def product(differences: Array) -> Callable[[Array], Array]:
-    """The product with A by FFT, for differences that are even in each coordinate."""
-    shape = differences.shape
-    wide = [fft.next_fast_len(2 * n - 1, real=True) for n in shape]
-    places = np.ix_(*[np.minimum(np.minimum(np.arange(m), m - np.arange(m)), n) for m, n in zip(wide, shape)])
-    spectrum = fft.rfftn(np.pad(differences, [(0, 1)] * len(shape))[places]).real
-    inside = tuple(slice(n) for n in shape)
-
-    def times(x: Array) -> Array:
-        return fft.irfftn(spectrum * fft.rfftn(x.reshape(shape), wide), wide)[inside].ravel()
-
-    return times
-
-
-def trial(differences: Array, transform: FastTransform, most: int = TRIAL_ITS) -> int:
-    """Iterations of conjugate gradients to 1e-8 with this preconditioner and a random right side; `most` at most."""
-    times = product(differences)
-    r = np.random.default_rng(0).standard_normal(prod(differences.shape))
-    enough = 1e-8 * float(np.linalg.norm(r))
-    p, rz = np.zeros_like(r), np.inf
-    for its in range(most):
-        z = transform.solve(r)
-        old, rz = rz, float(r @ z)
-        p = z + rz / old * p
-        q = times(p)
-        curvature = float(p @ q)
-        if not (rz > 0 and curvature > 0):
-            return TRIAL_ITS  # not positive
-        r = r - rz / curvature * q
-        if float(np.linalg.norm(r)) <= enough:
-            return its + 1
-    return most
+def _inverse(values: Array, bound: float | None) -> tuple[Array, bool]:
+    """The inverses of Hermitian blocks (..., b, b), and whether all are positive. Less than a bound counts as it."""
+    if values.shape[-1] == 1:
+        vectors, values = None, values[..., 0]
+    else:
+        values, vectors = np.linalg.eigh(values)
+    largest = float(values.max())
+    positive = largest > 0 and (bound is not None or values.min() > -FLOOR * largest)
+    inverse = 1 / np.maximum(values, max(bound or 0.0, FLOOR * abs(largest)) or 1.0)
+    if vectors is None:
+        return inverse[..., None], bool(positive)
+    return (vectors * inverse[..., None, :]) @ np.conj(np.swapaxes(vectors, -1, -2)), bool(positive)
 
 
-def best(differences: Array) -> tuple[float, int] | None:
-    """The share of the cosine transform with which a solution costs least, and its iterations, on a part of the grid.
+# -- the choice ----------------------------------------------------------------------------------------------
 
-    The part has at most 4096 points, of the same spacing. None if this part of A is not positive.
+
+@dataclass(frozen=True)
+class Choice:
+    """The preconditioner with which a solution costs least, and what trials on parts of the grid have shown."""
+
+    kind: Kind
+    promise: Promise
+
+
+def parts(shape: tuple[int, ...], periodic: Sequence[bool]) -> list[tuple[list[int], list[int]]]:
+    """Numbers of points and their distances of parts of a grid with at most POINTS points: the whole grid, or
+    neighbouring points and points that are spread over the grid. Periodic axes stay whole, if they are short enough.
     """
-    side = max(1, int(4096 ** (1 / differences.ndim) + 1e-9))
-    part = differences[tuple(slice(side) for _ in differences.shape)]
-    transforms = {share: FastTransform(part, share) for share in SHARES}
-    if not all(transform.positive for transform in transforms.values()):
+    if prod(shape) <= POINTS:
+        return [(list(shape), [1] * len(shape))]
+    whole = prod(n for n, around in zip(shape, periodic) if around)
+    if whole > POINTS / 16:
+        whole, periodic = 1, [False] * len(shape)
+    side = max(1, int((POINTS / whole) ** (1 / (len(shape) - sum(periodic))) + 1e-9))
+    sides = [n if around else side for n, around in zip(shape, periodic)]
+    strides = []
+    for n, side in zip(shape, sides):
+        least = -(-n // side)  # a divisor keeps what is periodic
+        strides.append(next((k for k in range(least, 2 * least) if n % k == 0), least))
+    spread = [-(-n // stride) for n, stride in zip(shape, strides)]
+    return [([min(n, side) for n, side in zip(shape, sides)], [1] * len(shape)), (spread, strides)]
+
+
+def choose(a: Differences) -> Choice | None:
+    """The preconditioner with which conjugate gradients cost least; None if a part of A is not positive definite.
+
+    Parts of the grid are principal submatrices of A: neighbouring points show how a behaves near zero, points that are
+    spread over the grid how it does far from it. If no preconditioner is good on both, those that win on one of them
+    have a trial on the whole grid.
+    """
+    if all(a.periodic):  # which a part of the grid does not show
+        exact = FastInverse(a, CIRCULANT)
+        return Choice(CIRCULANT, Promise(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
+    kinds = [kind for kind in CANDIDATES if a.block > 1 or kind != BLOCK_DIAGONAL]
+    trials: list[_Trial] = []
+    for counts, strides in parts(a.shape, a.periodic):
+        if trials:
+            kinds = [kind for kind in kinds if trials[0].costs[kind] < inf or kind in (NOTHING, CIRCULANT)]
+        trial = _trial(a.part(counts, strides), kinds)
+        if trial is None:
+            return None
+        trials.append(trial)
+    totals = {kind: prod(trial.costs[kind] for trial in trials) for kind in kinds}
+    found = min(kinds, key=lambda kind: totals[kind])
+    if totals[found] == inf:
+        whole = _trial(a, list(dict.fromkeys(trial.winner for trial in trials)))
+        if whole is None:
+            return None
+        found = whole.winner
+    worst = max(trials, key=lambda trial: iterations(trial.runs[found].norms))
+    alone = max((trial.runs[NOTHING].norms for trial in trials), key=iterations)
+    return Choice(found, Promise(worst.runs[found].each, worst.runs[found].norms, alone))
+
+
+class _Trial:
+    """Solutions with a matrix by conjugate gradients with preconditioners, with a random right side."""
+
+    def __init__(self, a: Differences, inverses: dict[Kind, FastInverse]) -> None:
+        times = a.times
+        b = np.random.default_rng(0).standard_normal(prod(a.shape) * a.block)
+        solves = {kind: inverse.solve if kind else None for kind, inverse in inverses.items()}
+        self.runs = {kind: ConjugateGradients(times, b, solves[kind], inverses[kind].each) for kind in inverses}
+        costs = race(list(self.runs.values()), SLACK, MOST)
+        self.costs = dict(zip(self.runs, costs))
+        self.winner = min(self.costs, key=lambda kind: self.costs[kind])
+        alone, enough = self.runs.get(NOTHING), 1e-8 * float(np.linalg.norm(b))
+        while alone and not alone.failed and alone.norms[-1] > enough and alone.cost < PATIENCE * min(costs):
+            alone.step()
+
+
+def _trial(a: Differences, kinds: Sequence[Kind]) -> _Trial | None:
+    """None if A is not positive definite."""
+    inverses = {kind: FastInverse(a, kind) for kind in kinds}
+    if not all(inverse.positive for inverse in inverses.values()):
         return None
-    found, least = (SHARES[0], TRIAL_ITS), np.inf
-    for share, transform in transforms.items():
-        each = 1.25 if share in (0.0, 1.0) else 1.5  # the cost of an iteration in products by FFT
-        its = trial(part, transform, int(min(TRIAL_ITS, least // each + 1)))
-        if its * each < least:
-            found, least = (share, its), its * each
-    return found
+    trial = _Trial(a, inverses)
+    return None if all(run.failed for run in trial.runs.values()) else trial
+
+
+# -- the differences of entries ------------------------------------------------------------------------------
 
 
 def depend_on_differences(
-    entries: Callable[[Array, Array], Array], shape: tuple[int, ...], order: Array | None, rng: np.random.Generator,
-    pairs: int = 512,
+    entries: Callable[[Array, Array], Array], shape: tuple[int, ...], block: int, order: Array | None,
+    rng: np.random.Generator, pairs: int = 512,
 ) -> bool | None:  # fmt: skip
     """Whether entries at random pairs are those at pairs of the same difference elsewhere.
 
     None: they are not. True: they also keep their values if coordinates of the difference change their signs.
-    The offsets of the pairs are of all sizes, so that steep kernels show.
+    The offsets of the pairs are of all sizes, so that steep kernels show. `order` has the row of each unknown of each
+    point; None: they are in this order.
     """
     places = []
     signs = rng.choice([-1, 1], (len(shape), pairs))
@@ -163,7 +393,8 @@ def depend_on_differences(
         here, there = rng.integers(0, n - offset, (2, pairs))
         places.append([here, here + offset, there, there + offset])
         places[-1] += [np.where(sign > 0, there, there + offset), np.where(sign > 0, there + offset, there)]
-    points = [np.ravel_multi_index(axis, shape) for axis in zip(*places)]
+    unknown = rng.integers(0, block, (2, pairs))
+    points = [np.ravel_multi_index(axis, shape) * block + unknown[k % 2] for k, axis in enumerate(zip(*places))]
     i, j, moved_i, moved_j, turned_i, turned_j = points if order is None else [order[p] for p in points]
     here, moved, turned = entries(i, j), entries(moved_i, moved_j), entries(turned_i, turned_j)
     if not _alike(here, moved):
@@ -177,21 +408,25 @@ def _alike(a: Array, b: Array) -> bool:
     return bool((np.abs(a - b) <= 1e-6 * largest + 1e-12 * largest.max(initial=0.0)).all())
 
 
-def means_of_differences(
-    entries: Callable[[Array, Array], Array], shape: tuple[int, ...], order: Array | None, even: bool
-) -> Array:
-    """The means (n_1, ..., n_D) of the entries over the signs of the coordinates of differences.
-
-    even : all signs give the same entries
-    """
-    size, chunk = prod(shape), 1 << 20  # entries that are evaluated at a time
-    out = np.zeros(size)
+def differences_of(
+    entries: Callable[[Array, Array], Array], shape: tuple[int, ...], block: int, order: Array | None, even: bool
+) -> Differences:
+    """The differences of a symmetric matrix whose entries depend on nothing else; arguments as before."""
+    size, chunk = prod(shape), max(1, (1 << 20) // block**2)  # entries that are evaluated at a time
+    values = np.zeros((*(shape if even else [2 * n - 1 for n in shape]), block, block))
     turns = [(1,) * len(shape)] if even else [(1, *signs) for signs in signs_of((1, -1), repeat=len(shape) - 1)]
+    p, q = np.indices((block, block)).reshape(2, -1)
     for first in range(0, size, chunk):
-        points = np.arange(first, min(first + chunk, size))
-        distance = np.unravel_index(points, shape)
+        distance = np.unravel_index(np.arange(first, min(first + chunk, size)), shape)
         for signs in turns:
-            i = np.ravel_multi_index(tuple(x if s > 0 else 0 * x for x, s in zip(distance, signs)), shape)
-            j = np.ravel_multi_index(tuple(x if s < 0 else 0 * x for x, s in zip(distance, signs)), shape)
-            out[points] += entries(i, j) if order is None else entries(order[i], order[j])
-    return out.reshape(shape) / len(turns)
+            ends = [
+                np.ravel_multi_index(tuple(x if s == side else 0 * x for x, s in zip(distance, signs)), shape) * block
+                for side in (1, -1)
+            ]
+            i, j = np.add.outer(ends[0], p).ravel(), np.add.outer(ends[1], q).ravel()
+            found = entries(i, j) if order is None else entries(order[i], order[j])
+            found = found.reshape(-1, block, block)
+            values[tuple(s * x for x, s in zip(distance, signs))] = found
+            if not even:
+                values[tuple(-s * x for x, s in zip(distance, signs))] = np.swapaxes(found, -1, -2)
+    return Differences(shape, values)

@@ -41,6 +41,7 @@ class Inverse:
     repaired : number of local systems that were not positive definite, because S was not, or nearly not
     certain : whether ||I - S X||_F is safely below 1. Then X has as many negative eigenvalues as S: on the line from
         S^-1 to X the matrix S^-1 - t (S^-1 - X) = S^-1 (I - t (I - S X)) is never singular
+    stopped : where the limit of the operations ended the growth of the ranks; empty if it did not
     """
 
     applied: Train
@@ -49,6 +50,7 @@ class Inverse:
     sweeps: int
     repaired: int
     certain: bool = False
+    stopped: str = ""
 
     @property
     def train(self) -> Train:
@@ -88,7 +90,8 @@ def invert_near_identity(
     """The inverse of S = I + T as X = I + Z, with an exact identity; arguments as in `invert`.
 
     The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z. `work`
-    counts operations; TooMuchWorkError at its limit. Z is cheaper to apply than X: it takes `Apply(Z)` and one
+    counts operations. Near its limit the ranks do not grow any more, and at the limit the result of the last whole
+    sweep is taken; TooMuchWorkError if there is none. Z is cheaper to apply than X: it takes `Apply(Z)` and one
     addition.
     """
     unit, norm = identity(T.rows), T.norm()
@@ -257,28 +260,38 @@ def _solve(
         work.spend(inner_operations(S, X, HIGH), INVERSION)
         return residual(S, X, B)
 
+    whole: tuple[Train, int] | None = None  # the result of the last sweep that was not stopped, and the number repaired
+    stopped = ""
     for count in range(1, sweeps + 1):
         begun = work.spent
         try:
             growing.sweep()
+            whole = Train(list(growing.x)), growing.repaired
+            if growing.estimate <= enough * norm:
+                X = whole[0]
+                left = measured(X)
+                if left <= eps:
+                    X, left = _rounded(X, left, eps, measured)
+                    return Inverse(X, False, left, count, growing.repaired)
+                enough *= 0.5 * eps / left  # the estimate sees only a part of the residual
+            if growing.estimate > IDLE * before:
+                if all(x.shape[3] >= r for x, r in zip(growing.x, most)):
+                    break
+                growing.drop *= 0.3
+            before = growing.estimate
+            # in the next pass ranks are up to twice as large, and one more pass has to make use of them
+            if work.spent + 8 * (work.spent - begun) > work.limit:
+                growing.most = most = [x.shape[3] for x in growing.x[:-1]]
+                stopped = growing.words(norm)
         except TooMuchWorkError:
-            raise TooMuchWorkError(growing.words(norm)) from None
-        if growing.estimate <= enough * norm:
-            X = Train(growing.x)
-            left = measured(X)
-            if left <= eps:
-                X, left = _rounded(X, left, eps, measured)
-                return Inverse(X, False, left, count, growing.repaired)
-            enough *= 0.5 * eps / left  # the estimate sees only a part of the residual
-        if growing.estimate > IDLE * before:
-            if all(x.shape[3] >= r for x, r in zip(growing.x, most)):
-                break
-            growing.drop *= 0.3
-        before = growing.estimate
-        if count < sweeps:  # in the next pass ranks are up to twice as large
-            work.foresee(4 * (work.spent - begun), growing.words(norm))
-    X = Train(growing.x)
-    return Inverse(X, False, measured(X), count, growing.repaired)
+            stopped = stopped or growing.words(norm)
+            if whole is None:
+                raise TooMuchWorkError(stopped) from None
+            break
+    assert whole is not None, "there is at least one sweep"
+    X, repaired = whole
+    left = residual(S, X, B)
+    return Inverse(X, False, left, count, repaired, stopped=stopped if left > eps else "")
 
 
 def _rounded(X: Train, left: float, eps: float, measured: Callable[[Train], float]) -> tuple[Train, float]:

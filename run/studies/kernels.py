@@ -1,6 +1,6 @@
-"""19 dense matrices with exact products by FFT, and harder ones without: CG to 1e-8 with `pctt.pc.TensorTrain` by its
-defaults (auto) and as a train of rank 100 at most (train), and with its rivals: run/study kernels [-only NAME...]
-[-ways WAY...] [-quick]. Writes results/kernels.json.
+"""19 dense matrices with exact products by FFT, 26 others of this kind, and harder ones without: CG to 1e-8 with
+`pctt.pc.TensorTrain` by its defaults (auto) and as a train of rank 100 at most (train), and with its rivals: run/study
+kernels [-only NAME...] [-ways WAY...] [-quick]. Writes results/kernels.json.
 
 Entries of the 19 depend on differences, so that products by FFT are exact. The unit of length is the side of the
 domain, in one dimension the spacing. Every solution is a process of its own; CPU seconds of one thread. Rivals: CG
@@ -22,11 +22,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import petsc4py
-from scipy import fft, linalg
+from scipy import fft, linalg, special
 
 petsc4py.init([sys.argv[0]])
 from petsc4py import PETSc
 from shared import Row, lines_of, parser, record, say_machine
+
+from pctt.tt import differences
 
 Array = np.ndarray
 Product = Callable[[Array], Array]
@@ -41,6 +43,7 @@ REPEAT, SHORT = 3, 3.0  # a solution of less than SHORT seconds is repeated, the
 WAYS = ("plain", "circulant", "nystrom", "train", "auto")
 OURS = {"auto": "auto", "train": "100"}  # -pc_tt_rank
 QUICK = ["exp02", "yukawa50", "laplace7", "imq1", "disc"]
+TICK = 1e-3  # seconds that are too few to compare
 CLOSE, FAR = 2.0, 3.0  # ratios to the fastest that the totals count
 
 # -- matrices -------------------------------------------------------------------------------------------------
@@ -49,7 +52,7 @@ CLOSE, FAR = 2.0, 3.0  # ratios to the fastest that the totals count
 class Problem:
     """A matrix of the unknowns of a grid by its ``entries``. ``times``: its product, None if there is no fast one."""
 
-    table: Array | None = None
+    a: differences.Differences | None = None
 
     def __init__(
         self, grid: tuple[int, ...], entries: Callable[[Array, Array], Array], times: Product | None, nugget: float
@@ -66,31 +69,16 @@ class Problem:
 
 
 class Differences(Problem):
-    """A(i, j) = table[|x_i - x_j|] for the points x of a grid; the nugget is in table[0]."""
+    """A(x, y) = a(x - y) for the points of a grid; the nugget is in a(0)."""
 
-    def __init__(self, table: Array, nugget: float = 0.0):
-        super().__init__(table.shape, self._entry, None, nugget)
-        self.table = table
+    def __init__(self, a: differences.Differences, nugget: float = 0.0):
+        super().__init__(a.shape, self._entry, a.times, nugget)
+        self.a = a
 
     def _entry(self, i: Array, j: Array) -> Array:
         x, y = np.unravel_index(i, self.grid), np.unravel_index(j, self.grid)
-        return self.table[tuple(np.abs(a - b) for a, b in zip(x, y))]
-
-    def product(self) -> Product:
-        """By FFT of the least good sizes, real to complex."""
-        wide = [fft.next_fast_len(2 * n - 1, real=True) for n in self.grid]
-        around = [np.minimum(np.arange(m), m - np.arange(m)) for m in wide]
-        values = np.pad(self.table, [(0, 1)] * len(self.grid))  # zero beyond the differences of the grid
-        values = values[np.ix_(*[np.minimum(a, n) for a, n in zip(around, self.grid)])]
-        transformed = fft.rfftn(values).real.copy()
-        part = tuple(slice(n) for n in self.grid)
-
-        def times(v: Array) -> Array:
-            spectrum = fft.rfftn(v.reshape(self.grid), wide)
-            spectrum *= transformed
-            return fft.irfftn(spectrum, wide, overwrite_x=True)[part].ravel()
-
-        return times
+        apart = [np.abs(u - v) if self.a.even else u - v for u, v in zip(x, y)]
+        return self.a.values[(*apart, 0, 0)]
 
 
 def radial(shape: tuple[int, ...], kernel: Kernel, nugget: float = 0.0, h: float | None = None) -> Differences:
@@ -99,7 +87,15 @@ def radial(shape: tuple[int, ...], kernel: Kernel, nugget: float = 0.0, h: float
     squares = sum(np.meshgrid(*[(np.arange(n) * h) ** 2 for n in shape], indexing="ij", sparse=True))
     table = np.asarray(kernel(np.sqrt(squares), h), float)
     table.flat[0] += nugget
-    return Differences(table, nugget)
+    return Differences(differences.Differences.of_even(table), nugget)
+
+
+def signed(shape: tuple[int, ...], kernel: Callable[..., Array], nugget: float) -> Differences:
+    """Of a function of the differences of grid indices along each axis."""
+    axes = [np.concatenate([np.arange(n), np.arange(1 - n, 0)]).astype(float) for n in shape]
+    table = np.asarray(kernel(*np.meshgrid(*axes, indexing="ij")), float)
+    table.flat[0] += nugget
+    return Differences(differences.Differences(shape, table[..., None, None]).compact(), nugget)
 
 
 def log(factor: float) -> Kernel:
@@ -127,7 +123,7 @@ def fractional(n: int, power: float) -> Differences:
     """(-Laplace)^power by the symbol (4 - 2 cos - 2 cos)^power, restricted to a square: zero outside."""
     t = 2 - 2 * np.cos(2 * np.pi * np.arange(TORUS) / TORUS)
     table = fft.irfft2((t[:, None] + t[: TORUS // 2 + 1]) ** power)[:n, :n]
-    return Differences(np.ascontiguousarray(table))
+    return Differences(differences.Differences.of_even(np.ascontiguousarray(table)))
 
 
 def multiquadric(width: float) -> Kernel:
@@ -168,6 +164,60 @@ def nineteen() -> dict[str, Callable[[], Problem]]:
         "gauss_odd": lambda: radial(odd, gauss(100, 0.1), 1.0, 1 / 512),
         "exp_odd": lambda: radial(odd, exponential(0.02), 0.1, 1 / 512),
     }
+
+
+def matern5(d: Array) -> Array:
+    """Matern's covariance of smoothness 5/2."""
+    return (1 + 5**0.5 * d + 5 / 3 * d**2) * np.exp(-(5**0.5) * d)
+
+
+def turned(x: Array, y: Array, angle: float, long: float, short: float) -> Array:
+    """Distances in lengths along and across a direction."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.hypot((c * x + s * y) / long, (c * y - s * x) / short)
+
+
+def around(x: Array, n: int) -> Array:
+    """Distances on a circle."""
+    return np.minimum(np.abs(x), n - np.abs(x))
+
+
+def others() -> dict[str, Callable[[], Problem]]:
+    """Kernels by differences that others have tried or that the choice was not made with: rotated, moving, periodic,
+    oscillating, separable, of a few waves, of long correlations. Lengths in spacings."""
+    season = lambda t, period: np.exp(-2 * np.sin(np.pi * t / period) ** 2)  # noqa: E731
+    wave = lambda x, y, a, b: np.cos(a * x + b * y)  # noqa: E731
+    return {
+        "matern_axes": lambda: signed((200, 200), lambda x, y: matern5(turned(x, y, 0, 20, 4)), 0.01),
+        "matern_30": lambda: signed((200, 200), lambda x, y: matern5(turned(x, y, 0.52, 20, 4)), 0.01),
+        "exp_60": lambda: signed((160, 120), lambda x, y: np.exp(-turned(x, y, 1.05, 30, 2)), 0.001),
+        "gauss_23": lambda: signed((128, 128), lambda x, y: np.exp(-turned(x, y, 0.4, 15, 3) ** 2 / 2), 0.01),
+        "matern_box": lambda: signed((24,) * 3, lambda x, y, z: matern5(np.hypot(turned(x, y, 0, 8, 4), z / 2)), 0.01),
+        "gp_64": lambda: signed((64, 64, 64), lambda x, y, z: matern5(np.hypot(np.hypot(x, y), z) / 6), 0.1),
+        "sinc": lambda: signed((24,) * 3, lambda x, y, z: np.sinc(0.3 / np.pi * np.hypot(np.hypot(x, y), z)), 0.1),
+        "bessel": lambda: signed((128, 128), lambda x, y: special.j0(0.3 * np.hypot(x, y)), 0.1),
+        "separable": lambda: signed((24, 24, 20), lambda x, y, t: np.exp(-np.hypot(x, y) / 6 - np.abs(t) / 8), 0.01),
+        "gneiting": lambda: signed(
+            (24, 24, 20),
+            lambda x, y, t: np.exp(-np.hypot(x, y) / (36 + 7.2 * np.abs(t)) ** 0.5) / (1 + np.abs(t) / 5), 0.01),
+        "moving": lambda: signed((96, 96), lambda x, t: np.exp(-np.hypot((x - 0.8 * t) / 6, t / 12)), 0.01),
+        "moving3": lambda: signed(
+            (24, 24, 20), lambda x, y, t: np.exp(-np.hypot(np.hypot(x - 0.5 * t, y) / 6, t / 9)), 0.01),
+        "season": lambda: signed((96, 96), lambda x, t: matern5(np.abs(x) / 8) * season(t, 12), 0.01),
+        "season_100": lambda: signed((100, 100), lambda x, t: matern5(np.abs(x) / 8) * season(t, 12), 0.01),
+        "season_365": lambda: signed((64, 365), lambda x, t: np.exp(-np.abs(x) / 8) * season(t, 30.4), 0.05),
+        "quasi": lambda: signed((8192,), lambda t: np.exp(-np.abs(t) / 500) * season(t, 37), 0.01),
+        "torus": lambda: signed((64, 64), lambda x, y: np.exp(-(around(x, 64) + around(y, 64)) / 5), 0.01),
+        "torus_129": lambda: signed((129, 129), lambda x, y: np.exp(-(around(x, 129) + around(y, 129)) / 7), 0.01),
+        "cylinder": lambda: signed((163, 178), lambda x, y: np.exp(-around(x, 163) / 5 - np.abs(y) / 2), 0.003),
+        "product": lambda: signed((128, 128), lambda x, y: np.cos(0.5 * x) * np.cos(0.5 * y), 0.1),
+        "waves": lambda: signed((150, 150), lambda x, y: wave(x, y, 0.3, 0.1) + wave(x, y, 0.2, -0.4), 0.5),
+        "power": lambda: signed((30000,), lambda x: (1 + np.abs(x)) ** -0.5, 0.0),
+        "gauss_60": lambda: signed((256, 256), lambda x, y: np.exp(-(np.hypot(x, y) / 60) ** 2 / 2), 0.01),
+        "gauss_100": lambda: signed((256, 128), lambda x, y: np.exp(-turned(x, y, 0, 100, 15) ** 2 / 2), 0.1),
+        "rational": lambda: signed((300, 200), lambda x, y: 1 / (1 + turned(x, y, 0, 30, 10) ** 2), 0.001),
+        "tent": lambda: signed((146, 144), lambda x, y: np.maximum(1 - turned(x, y, 0.8, 70, 100), 0) ** 2, 0.01),
+    }  # fmt: skip
 
 
 def weighted(n: int, weight: Callable[[Array, Array], Array]) -> Problem:
@@ -222,22 +272,8 @@ class Shell:
 
 
 def circulant(problem: Problem) -> Product:
-    """The circulant nearest to the matrix in Frobenius' norm (T. Chan, SIAM J. Sci. Stat. Comput. 9, 1988), its
-    eigenvalues not below a tenth of the nugget or 1e-12 of the largest one."""
-    column = problem.table
-    for axis, n in enumerate(problem.grid):
-        part = np.moveaxis(column, axis, -1)
-        t = np.arange(n)
-        column = np.moveaxis(((n - t) * part + t * part[..., (n - t) % n]) / n, -1, axis)
-    values = fft.rfftn(column).real
-    inverse = 1 / np.maximum(values, max(0.1 * problem.nugget, 1e-12 * values.max()))
-
-    def times(r: Array) -> Array:
-        spectrum = fft.rfftn(r.reshape(problem.grid))
-        spectrum *= inverse
-        return fft.irfftn(spectrum, problem.grid, overwrite_x=True).ravel()
-
-    return times
+    """The circulant nearest to the matrix in Frobenius' norm (T. Chan, SIAM J. Sci. Stat. Comput. 9, 1988)."""
+    return differences.FastInverse(problem.a, differences.CIRCULANT).solve
 
 
 def nystrom(problem: Problem) -> Product:
@@ -264,7 +300,7 @@ def nystrom(problem: Problem) -> Product:
 
 def applies(way: str, problem: Problem) -> str:
     """Why a way is no way for this problem; empty if it is one."""
-    if way == "circulant" and problem.table is None:
+    if way == "circulant" and problem.a is None:
         return "entries do not depend on differences"
     if way == "nystrom" and not problem.nugget:
         return "no nugget"
@@ -314,7 +350,7 @@ def solve(way: str, problem: Problem) -> Row:
 
 def child(name: str, way: str) -> None:
     """One solution, as a line of JSON."""
-    problem = {**nineteen(), **hard()}[name]()
+    problem = {**nineteen(), **others(), **hard()}[name]()
     row = solve(way, problem)
     for _ in range(REPEAT - 1 if row["setup_s"] + row["solve_s"] < SHORT else 0):
         again = solve(way, problem)
@@ -346,7 +382,7 @@ def text(row: Row) -> str:
 
 def main(given: argparse.Namespace) -> None:
     about = say_machine()
-    names = {**nineteen(), **hard()}
+    names = {**nineteen(), **others(), **hard()}
     chosen = given.only or (QUICK if given.quick else list(names))
     rows: list[Row] = []
     for name in chosen:
@@ -363,8 +399,8 @@ def main(given: argparse.Namespace) -> None:
                 row = found[way]
                 warned = f"; WARNED: {row['warned']}" if row["warned"] else ""
                 print(f"    {way}: {row['what']}, true residual {row['residual']:.1e}{warned}", flush=True)
-    totals = [score([row for row in rows if (row["name"] in nineteen()) == fast], words)
-              for fast, words in ((True, "with an FFT"), (False, "hard"))]  # fmt: skip
+    sets = (("with an FFT", nineteen()), ("others with an FFT", others()), ("hard", hard()))
+    totals = [score([row for row in rows if row["name"] in names], words) for words, names in sets]
     record("kernels", about, rows + [score_ for score_ in totals if score_])
 
 
@@ -374,7 +410,7 @@ def score(rows: list[Row], words: str) -> Row:
     for row in rows:
         best = min((total(found) for found in row["ways"].values()), default=np.inf)
         if "auto" in row["ways"] and np.isfinite(best):
-            ratios[row["name"]] = total(row["ways"]["auto"]) / best
+            ratios[row["name"]] = total(row["ways"]["auto"]) / max(best, TICK)
     if not ratios:
         return {}
     worst = max(ratios, key=lambda name: ratios[name])
@@ -386,12 +422,28 @@ def score(rows: list[Row], words: str) -> Row:
         f"{close}, within {FAR:g} in {far}; worst ratio {ratios[worst]:.3g} ({worst}); beyond {FAR:g} without a "
         f"warning: {', '.join(silent) or 'none'}"
     )
-    return {"set": words, "fastest": fastest, "close": close, "of": len(ratios), "ratios": ratios, "silent": silent}
+    more = iterations_beyond(rows)
+    if more:
+        worst = max(more, key=lambda name: more[name])
+        print(f"    iterations: at most {more[worst]:.2f} times the fewer of CG alone and the circulant ({worst})")
+    found = {"set": words, "fastest": fastest, "close": close, "of": len(ratios), "ratios": ratios, "silent": silent}
+    return found | {"iteration_ratios": more}
+
+
+def iterations_beyond(rows: list[Row]) -> dict[str, float]:
+    """The iterations of TensorTrain by its defaults, divided by the fewer of CG alone and the circulant."""
+    ratios = {}
+    for row in rows:
+        its = {way: found["iterations"] for way, found in row["ways"].items() if np.isfinite(total(found))}
+        rivals = [its[way] for way in ("plain", "circulant") if way in its]
+        if rivals and "auto" in row["ways"]:
+            ratios[row["name"]] = its.get("auto", np.inf) / min(rivals)
+    return ratios
 
 
 if __name__ == "__main__":
     words = parser("kernels", __doc__)
-    words.add_argument("-only", nargs="+", choices=[*nineteen(), *hard()], help="problems")
+    words.add_argument("-only", nargs="+", choices=[*nineteen(), *others(), *hard()], help="problems")
     words.add_argument("-ways", nargs="+", choices=WAYS, default=WAYS, help="ways to solve them")
     words.add_argument("-quick", action="store_true", help="five problems")
     words.add_argument("-child", nargs=2, help=argparse.SUPPRESS)

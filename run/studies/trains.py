@@ -36,7 +36,8 @@ PAPER = {
     (1e-3, 10): (8.7, 8.5, 16), (1e-3, 100): (59.3, 45.2, 1244), (1e-3, 1000): (65.2, 46.4, 1317),
     (1e-4, 10): (9.1, 9.0, 16), (1e-4, 100): (68.6, 58.1, 2740), (1e-4, 1000): (113.3, 91.2, 8157),
 }  # fmt: skip
-LEVELS = ("none", "newton", "trains")  # of reuse
+LEVELS = ("none", "newton", "trains")  # of reuse: nothing, cores within a time step, whole trains from step to step
+REUSE = ("none", "cores", "trains")  # their -pc_tt_reuse
 COUNTS = ("made", "kept", "none", "anew")  # of the last level
 SOLVED = ("none", "trains", "pbjacobi")  # levels whose trains solve a system, and the preconditioner without a train
 CAP = 1000  # iterations
@@ -57,9 +58,9 @@ class WatchedSparseTrain(SparseTrain):
         self.rows[-1] |= {"matrix_rank": mean_rank(found.train.ranks)}
         return found
 
-    def _invert(self, warm: bool):
+    def _invert(self, warm: bool, null: list[np.ndarray]):
         start = time.perf_counter()
-        inverse = super()._invert(warm)
+        inverse = super()._invert(warm, null)
         self.rows[-1] |= {"invert_s": time.perf_counter() - start, "residual": inverse.residual}
         # what is stored of I + Z is Z, of one rank less
         self.rows[-1] |= {"inverse_rank": mean_rank(inverse.applied.ranks) + inverse.identity}
@@ -71,7 +72,7 @@ class WatchedSparseTrain(SparseTrain):
 
 
 class WatchedTrain(TensorTrain):
-    """A tensor train whose set-ups are timed phase by phase; a rank that failed is tried again at the next matrix.
+    """A tensor train whose set-ups are timed phase by phase; a rank that failed is always tried again at once.
 
     Attributes
     ----------
@@ -120,7 +121,7 @@ def set_up(pc: PETSc.PC, matrix: PETSc.Mat) -> Row:
 
 def of_cap(replay: Replay, eps: float, cap: int, scaling: str, every: int) -> Row:
     """Averages over the systems, and seconds per PDIP solve: means times all its Newton steps."""
-    pc = train_pc(eps=eps, rank=cap, scaling=scaling, reuse="steps")
+    pc = train_pc(eps=eps, rank=cap, variant=scaling, reuse="cores")
     done = [dict(set_up(pc, replay.matrix(system))) for system in replay.systems[::every]]
     pc.destroy()
     rows = [row for row in done if "inverse_rank" in row]
@@ -146,7 +147,7 @@ def ranks(given: Namespace) -> list[Row]:
         invert_s=("invert_s", "10.2f"),
     )  # fmt: skip
     rows: list[Row] = []
-    for scaling, cap, eps in [(way, cap, eps) for way in ("block", "none") for cap in given.caps for eps in EPS]:
+    for scaling, cap, eps in [(way, cap, eps) for way in ("own", "unscaled") for cap in given.caps for eps in EPS]:
         every = given.every if cap <= 10 else max(given.every, len(replay.systems) // 3)
         rows.append(of_cap(replay, eps, cap, scaling, every))
         paper = "{}/{} {} s".format(*PAPER[eps, cap]) if (eps, cap) in PAPER else "-"
@@ -170,19 +171,22 @@ def reuse(given: Namespace) -> list[Row]:
                   **{name: (name, "13.2f") for name in names}, **{name: (name, "7") for name in COUNTS},
                   **{f"its_{name}": (f"its {name}", "10") for name in SOLVED})  # fmt: skip
     for n in given.n:
-        pcs = {level: train_pc(reuse=level, rank=10, eps=1e-2) for level in LEVELS}
+        pcs = {level: train_pc(reuse=of_level, rank=10, eps=1e-2) for level, of_level in zip(LEVELS, REUSE)}
         account, before = pcs["trains"].getPythonContext().account, dict.fromkeys(COUNTS, 0)
         for step, replay in enumerate(replays(n, given.steps), start=1):
             seconds: dict[str, list[float]] = {level: [] for level in LEVELS}
             row: Row = {"n": n, "step": step, "contacts": replay.contacts, "newton": len(replay.systems)}
-            for pc in pcs.values():
-                pc.reset()
+            pcs["newton"].destroy()
+            pcs["newton"] = train_pc(reuse="cores", rank=10, eps=1e-2)
+            pcs["trains"].reset()
             timed = (step - 2) % given.every == 0
             levels = LEVELS if timed else LEVELS[-1:]
             for k, system in enumerate(replay.systems):
                 matrix = replay.matrix(system)
                 for turn in range(len(levels)):
                     level = levels[(k + turn) % len(levels)]  # each is the first, with a cold cache, as often
+                    if level == "none":
+                        pcs[level].reset()
                     seconds[level].append(set_up(pcs[level], matrix)["setup_s"])
                 if timed and k == len(replay.systems) // 2:
                     row |= {f"its {name}": iterations(pcs.get(name), matrix, system.b) for name in SOLVED}
@@ -240,12 +244,12 @@ def iterations(pc: PETSc.PC | None, matrix: PETSc.Mat, right_side: np.ndarray) -
 def phases(replay: Replay) -> Row:
     """Seconds for a cold start with a matrix and a warm one with the next, medians; of an application, and of S x."""
     runs: dict[str, list[float]] = {}
-    for way in ("als", "cross") * REPEAT:
-        pc = train_pc(compress=way, rank=10, eps=1e-2, reuse="steps")
+    for way in ("own", "cross") * REPEAT:
+        pc = train_pc(variant=way, rank=10, eps=1e-2, reuse="cores")
         for state, system in zip(("cold", "warm"), replay.systems[-2:]):
             done = set_up(pc, replay.matrix(system))
             runs.setdefault(f"{way} {state}", []).append(done["compress_s"])
-            if way == "als":
+            if way == "own":
                 runs.setdefault(f"invert {state}", []).append(done["invert_s"])
                 runs.setdefault(f"set-up {state}", []).append(done["setup_s"])
         pc.destroy()

@@ -128,15 +128,16 @@ def test_the_inverse_multiplies_numbers_of_any_size():
         np.testing.assert_allclose(gathered(y) / (size or 1.0), np.linalg.solve(A, v) * (size > 0), atol=0.05)
 
 
-def test_new_values_make_a_new_train():
+@pytest.mark.parametrize(("reuse", "reused"), [("none", 0), ("cores", 1)])
+def test_new_values_make_a_new_train(reuse, reused):
     scale = 1.0
     mat = shell(lambda i, j: scale * KERNEL(i, j), A, grid=GRID)
-    ksp = ready(mat, rank=100)
+    ksp = ready(mat, rank=100, reuse=reuse)
     scale = 4.0
     mat.stateIncrease()
     ksp.setOperators(mat)
     ksp.setUp()
-    assert context(ksp).account.reused == 1
+    assert context(ksp).account.reused == reused
     assert context(ksp).made.compressed.shift == pytest.approx(8.0)
 
 

@@ -56,7 +56,7 @@ def test_all_types_of_matrices_give_the_same_preconditioner(rank):
 def test_a_matrix_without_entries_or_of_another_shape_is_refused():
     shell = PETSc.Mat().createPython((9, 9), type("Shell", (), {"mult": lambda *_: None})())
     shell.setUp()
-    with refused("type python has no entries to read; allowed are aij"):
+    with refused("type python has no entries to read; allowed are aij.*any Mat with the attribute entries"):
         solver(shell).setUp()
     wide = PETSc.Mat().createAIJ((6, 9), nnz=1)
     wide.assemble()
@@ -88,13 +88,14 @@ def test_a_matrix_that_is_not_symmetric_is_said_to_be_so():
     mat[0, 1] = -3.0
     mat.assemble()
     assert not is_symmetric(mat)
-    ksp = solver(mat)
+    ksp = solver(mat, rank=8)
     with pytest.warns(UserWarning, match="not symmetric"):
         ksp.setUp()
     assert "not symmetric" in report(ksp)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         solver(poisson(8)).setUp()
+        solver(mat, rank="auto").setUp()  # which makes no train
 
 
 @pytest.mark.parametrize("method", ["cg", "bcgs", "minres"])
@@ -153,3 +154,25 @@ def test_an_error_of_the_user_ends_in_its_own_words(end):
     assert words in done.stderr
     assert "Traceback" in done.stderr
     assert "Segmentation" not in done.stderr
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("kind", ["nest", "python"])
+def test_a_matrix_without_entries_gets_its_diagonal(kind):
+    mat = poisson(8)
+    factor = mat.createVecLeft()
+    factor.array[:] = 1.0 + np.arange(*mat.getOwnershipRange())
+    mat.diagonalScale(factor, factor)
+    expected, _ = solve(solver(mat, rank="1"))
+    if kind == "nest":
+        other = PETSc.Mat().createNest([[mat]])
+    else:
+        methods = {"mult": lambda s, m, x, y: mat.mult(x, y), "getDiagonal": lambda s, m, v: mat.getDiagonal(v)}
+        other = PETSc.Mat().createPython(mat.getSizes(), type("Shell", (), methods)(), comm=mat.comm)
+        other.setUp()
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        its, left = solve(solver(other, rank="auto"))
+    assert its == expected
+    assert left < 1e-7
+    assert any("its diagonal is used" in str(one.message) for one in heard) == (mat.comm.rank == 0)

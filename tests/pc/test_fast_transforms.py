@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from train_solver import context, dense_of, operator, ready, report, shell, solve
+from train_solver import context, dense_of, operator, ready, report, shell, solve, solver
 
-from pctt.tt.differences import FastTransform, depend_on_differences, means_of_differences
+from pctt.mat import from_differences
+from pctt.tt import differences as of
+from pctt.tt.conjugate import Promise
 
 GRID = (10, 7)
 SIZE = 70
@@ -24,7 +26,15 @@ def covariance(i: np.ndarray, j: np.ndarray) -> np.ndarray:
 def oblique(i: np.ndarray, j: np.ndarray) -> np.ndarray:
     """Of differences, but other for (1, 1) than for (1, -1)."""
     x, y = np.subtract(np.unravel_index(i, GRID), np.unravel_index(j, GRID))
-    return 1.0 * (i == j) + 0.3 * np.exp(-np.abs(x - 0.7 * y))
+    return 0.03 * (i == j) + np.exp(-np.hypot(x - 0.4 * y, y) / 6)
+
+
+def pairs(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Two unknowns a point; mixed entries are odd in both coordinates."""
+    x, y = np.subtract(np.unravel_index(i // 2, GRID), np.unravel_index(j // 2, GRID)) / 6.0
+    p, q, r = i % 2, j % 2, np.hypot(x, y)
+    along = np.where(p == 0, x, y) * np.where(q == 0, x, y)
+    return 0.05 * (i == j) + ((p == q) * (1 + r) - along) * np.exp(-r)
 
 
 def weighted(i: np.ndarray, j: np.ndarray) -> np.ndarray:
@@ -41,38 +51,136 @@ def made(ksp: PETSc.KSP):
 
 
 def test_differences_are_recognised():
+    def kind(entries, block=1, order=None):
+        return of.depend_on_differences(entries, GRID, block, order, rng)
+
     rng = np.random.default_rng(0)
-    assert depend_on_differences(covariance, GRID, None, rng) is True
-    assert depend_on_differences(oblique, GRID, None, rng) is False
+    assert kind(covariance) is True
+    assert kind(oblique) is False
     for entries in (weighted, lambda i, j: covariance(i, j) + 1e-3 * i * (i == j), lambda i, j: 1.0 / (1 + i + j)):
-        assert depend_on_differences(entries, GRID, None, rng) is None
+        assert kind(entries) is None
     order = rng.permutation(SIZE)
     of_row = np.argsort(order)
-    assert depend_on_differences(lambda i, j: covariance(of_row[i], of_row[j]), GRID, order, rng) is True
-    assert depend_on_differences(lambda i, j: covariance(of_row[i], of_row[j]), GRID, None, rng) is None
+    assert kind(lambda i, j: covariance(of_row[i], of_row[j]), order=order) is True
+    assert kind(lambda i, j: covariance(of_row[i], of_row[j])) is None
+    assert kind(pairs, 2) is False
+    assert kind(lambda i, j: covariance(i // 2, j // 2) * (1 + (i % 2 == j % 2)), 2) is True
+    assert kind(lambda i, j: pairs(i, j) + 0.01 * (i == j) * i, 2) is None
 
 
-@pytest.mark.parametrize(("entries", "even"), [(covariance, True), (oblique, False)])
-def test_means_are_those_over_all_signs(entries, even):
-    A = dense_of(entries, SIZE)
-    x, y = np.unravel_index(np.arange(SIZE), GRID)
-    found = means_of_differences(entries, GRID, None, even)
-    for a, b in ((0, 0), (3, 2), (9, 6), (0, 4)):
-        each = [A[(x[:, None] - x == s * a) & (y[:, None] - y == t * b)].mean() for s in (1, -1) for t in (1, -1)]
-        assert found[a, b] == pytest.approx(np.mean(each))
+@pytest.mark.parametrize(("entries", "even", "block"), [(covariance, True, 1), (oblique, False, 1), (pairs, False, 2)])
+def test_the_differences_are_those_of_the_entries(entries, even, block):
+    A = dense_of(entries, SIZE * block)
+    order = np.random.default_rng(0).permutation(SIZE * block)
+    of_row = np.argsort(order)
+    for a in (
+        of.differences_of(entries, GRID, block, None, even),
+        of.differences_of(lambda i, j: entries(of_row[i], of_row[j]), GRID, block, order, even),
+    ):
+        assert a.even == even
+        assert a.symmetric
+        np.testing.assert_allclose(a.times(np.eye(len(A))), A, atol=1e-12)
 
 
 @pytest.mark.parallel(1, 2, 3)
-@pytest.mark.parametrize("entries", [covariance, oblique])
-def test_the_preconditioner_is_the_transform(entries):
-    ksp = preconditioner(entries)
-    name, share = made(ksp).transform.transform.name, made(ksp).transform.transform.share
-    assert f"{name} of a grid of 10 x 7" in report(ksp)
-    transform = FastTransform(means_of_differences(entries, GRID, None, entries is covariance), share)
-    np.testing.assert_allclose(operator(ksp).T, [transform.solve(v) for v in np.eye(SIZE)], rtol=1e-9, atol=1e-14)
+@pytest.mark.parametrize(("entries", "even", "block"), [(covariance, True, 1), (oblique, False, 1), (pairs, False, 2)])
+def test_the_preconditioner_is_the_transform(entries, even, block):
+    A = dense_of(entries, SIZE * block)
+    ksp = ready(shell(entries, A, grid=GRID, block=block), rtol=1e-10)
+    inverse = made(ksp).transform.inverse
+    assert inverse.kind
+    assert f"{inverse.name} of a grid of 10 x 7" in report(ksp)
+    wanted = of.FastInverse(of.differences_of(entries, GRID, block, None, even), inverse.kind)
+    np.testing.assert_allclose(operator(ksp).T, wanted.solve(np.eye(len(A))), rtol=1e-9, atol=1e-14)
     iterations, left = solve(ksp)
-    assert iterations <= 20
+    assert iterations <= 60
     assert left < 1e-8
+
+
+@pytest.mark.parallel(1, 3)
+@pytest.mark.parametrize("rank", ["auto", "20", "1"])
+def test_many_vectors_are_multiplied_at_a_time(rank):
+    ksp = preconditioner(covariance, rank=rank)
+    A, _ = ksp.getOperators()
+    X = PETSc.Mat().createDense((A.getSizes()[0], (PETSc.DECIDE, 4)), comm=A.comm)
+    X.setUp()
+    X.getDenseArray()[:] = np.random.default_rng(A.comm.rank).standard_normal(X.getDenseArray().shape)
+    X.assemble()
+    Y, y = X.duplicate(), A.createVecLeft()
+    calls, times = [], made(ksp).times
+    made(ksp).times = lambda x: calls.append(x.shape) or times(x)
+    ksp.pc.matApply(X, Y)
+    assert len(calls) == (rank != "1")
+    for k in range(4):
+        ksp.pc.apply(X.getColumnVector(k), y)
+        np.testing.assert_allclose(Y.getDenseArray(readonly=True)[:, k], y.array_r, rtol=1e-12, atol=1e-13)
+
+
+# -- watching -------------------------------------------------------------------------------------------------
+
+
+def waves(s: np.ndarray) -> np.ndarray:
+    """Few eigenvalues are large: conjugate gradients alone take five iterations, with a cosine transform hundreds."""
+    return 0.1 * (s == 0).all(axis=0) + np.cos(0.5 * s[0]) * np.cos(0.4 * s[1])
+
+
+def promised(kind: of.Kind, norms: list[float], alone: list[float]):
+    """A choice of this preconditioner, whether it is good or not."""
+    return lambda a: of.Choice(kind, Promise(of.FastInverse(a, kind).each, norms, alone))
+
+
+@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parametrize("method", ["cg", "gmres", "bcgs", "minres", "fcg"])
+@pytest.mark.parametrize(("norm", "guess"), [("unpreconditioned", False), ("preconditioned", True), ("natural", False)])
+def test_a_preconditioner_that_breaks_its_promise_is_left(method, norm, guess, monkeypatch):
+    if method not in {"cg", "fcg"} and norm != ("preconditioned" if method == "minres" else "unpreconditioned"):
+        pytest.skip("PETSc has no such method, or it takes the norm of another residual")
+    monkeypatch.setattr(of, "choose", promised(of.CANDIDATES[3], [1.0, 1e-1, 1e-8], [1.0, 1e-1, 1e-8]))
+    ksp = solver(from_differences(waves, (40, 40)), method, rtol=1e-8)
+    ksp.setNormType(getattr(PETSc.KSP.NormType, norm.upper()))
+    if method in {"gmres", "bcgs"} and norm == "unpreconditioned":
+        ksp.setPCSide(PETSc.PC.Side.RIGHT)
+    ksp.setInitialGuessNonzero(guess)
+    ksp.setUp()
+    A, _ = ksp.getOperators()
+    x, b = A.createVecs()
+    x.set(0.3)
+    b.array[:] = np.random.default_rng(1).standard_normal(1600)[slice(*b.getOwnershipRange())]
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() > 0
+    assert ksp.max_it == 2000
+    assert ksp.getIterationNumber() <= 16
+    r = b.duplicate()
+    A.mult(x, r)
+    r.aypx(-1.0, b)
+    assert r.norm() <= 1e-6 * b.norm()
+    assert "no preconditioner, no train, because conjugate gradients alone take" in report(ksp)
+    ksp.setInitialGuessNonzero(False)
+    ksp.solve(b, x)  # the next solve has none from the start
+    assert ksp.getIterationNumber() <= 6
+
+
+def test_one_that_keeps_its_promise_is_not_left():
+    A = from_differences(lambda s: 0.01 * (s == 0).all(axis=0) + np.exp(-np.hypot(*s) / 12), (50, 50))
+    products = []
+    mult = A.getPythonContext().mult
+    A.getPythonContext().mult = lambda mat, x, y: products.append(1) or mult(mat, x, y)
+    ksp = ready(A, rtol=1e-8)
+    iterations, left = solve(ksp)
+    assert left < 1e-6
+    assert len(products) <= iterations + 2
+    assert "cosine" in report(ksp)
+
+
+def test_the_promise_of_a_worse_method_is_kept_where_none_is_worse_still(monkeypatch):
+    """Conjugate gradients alone are tried beside, and not taken, as they are slower."""
+    monkeypatch.setattr(of, "choose", promised(of.CANDIDATES[3], [1.0, 1e-8], [1.0, 1e-1, 1e-8]))
+    A = from_differences(lambda s: 0.01 * (s == 0).all(axis=0) + np.exp(-np.hypot(*s) / 12), (50, 50))
+    ksp = ready(A, rtol=1e-8)
+    iterations, left = solve(ksp)
+    assert iterations < 40
+    assert left < 1e-6
+    assert "cosine" in report(ksp)
 
 
 @pytest.mark.parallel(1, 3)
@@ -108,19 +216,54 @@ def test_unsymmetric_and_indefinite_entries_get_no_transform():
             assert made(preconditioner(entries)).transform is None
 
 
-def test_a_train_that_failed_is_not_tried_again():
-    calls = []
+class Fit:
+    """Hyperparameters that change between solves, in one Mat. Entries do not depend on differences."""
 
-    def entries(i, j):
-        calls.append(len(i))
-        return covariance(i, j)
+    def __init__(self, side: int = 24) -> None:
+        self.side, self.length, self.nugget = side, 0.0, 0.0
 
-    with pytest.warns(UserWarning, match="transform takes over"):
-        ksp = preconditioner(entries, rank=30, setup_limit=1e6)
-    first = sum(calls)
-    calls.clear()
-    ksp.getOperators()[0].stateIncrease()
-    ksp.setOperators(ksp.getOperators()[0])
-    ksp.setUp()
-    assert "transform" in made(ksp).base
-    assert sum(calls) < first
+    def __call__(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        x, y = (np.array(np.unravel_index(k, (self.side, self.side))) / self.side for k in (i, j))
+        near = np.exp(-np.sqrt(((x - y) ** 2).sum(axis=0)) / self.length)
+        return (1 + x[0]) * (1 + y[0]) * near + self.nugget * (i == j)
+
+    def set(self, length: float, nugget: float, A: np.ndarray) -> None:
+        self.length, self.nugget = length, nugget
+        A[:] = dense_of(self, self.side**2)
+
+
+@pytest.mark.parallel(1, 2)
+def test_a_refusal_holds_for_its_values():
+    """Easy hyperparameters after hard ones get the train that they get in a new solver."""
+    fit = Fit()
+    A = np.empty((fit.side**2, fit.side**2))
+    mat = shell(fit, A, grid=(fit.side, fit.side))
+    ksp = None
+    for length, nugget, refused in ((0.3, 1e-4, True), (0.03, 1.0, False), (1.0, 1e-4, True), (0.05, 2.0, False)):
+        fit.set(length, nugget, A)
+        mat.stateIncrease()
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            ksp = ksp or solver(mat, rank=8)
+            ksp.setOperators(mat)
+            ksp.setUp()
+        assert bool(made(ksp).failure) == refused
+        assert any("takes over" in str(one.message) for one in heard) == (refused and MPI.COMM_WORLD.rank == 0)
+        if not refused:
+            its, _ = solve(ksp)
+            assert its == solve(ready(mat, rank=8))[0]
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("limit", [3e8, 1e8])
+def test_at_the_limit_of_operations_the_last_inverse_is_kept(limit):
+    """So a larger rank is no worse than a small one, which ends below the limit."""
+    size = 256
+    A = 1.0 / np.add.outer(np.arange(size), np.arange(1, size + 1)) + 1e-3 * np.eye(size)
+    its = {}
+    for rank in (16, 64):
+        ksp = ready(shell(lambda i, j: A[i, j], A, grid=(size,)), rank=rank, setup_limit=limit)
+        assert context(ksp).rank > 1
+        its[rank] = solve(ksp)[0]
+    assert its[64] <= its[16] + 2
+    assert "the limit of operations" in report(ksp)

@@ -80,9 +80,9 @@ def test_a_view_before_the_set_up(capfd):
 
 
 def test_options_for_all_levels_are_those_of_each():
-    PETSc.Options().insertString("-mg_levels_pc_tt_max_rank 7")
+    PETSc.Options().insertString("-mg_levels_pc_tt_rank 7")
     ksp = solver(poisson(8), prefix="mg_levels_1_")
-    assert ksp.pc.getPythonContext().options.max_rank == 7
+    assert ksp.pc.getPythonContext().options.rank == "7"
 
 
 def test_new_options_are_those_of_the_next_set_up():
@@ -116,7 +116,7 @@ def test_zeros_that_are_stored(block):
 
 def test_another_pattern_with_as_many_nonzeros():
     mat = stored(ring(40, 1))
-    ksp = solver(mat, reuse="steps", **SMALL)
+    ksp = solver(mat, reuse="cores", **SMALL)
     left(ksp)
     other = sp.csr_matrix(ring(40, 7))
     mat.setPreallocationCSR((other.indptr, other.indices, other.data))

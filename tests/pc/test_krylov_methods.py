@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from petsc4py import PETSc
@@ -25,12 +27,14 @@ def mat():
 
 def made(mat: PETSc.Mat, precision: str) -> PETSc.PC:
     """The preconditioner, which all methods share."""
-    PETSc.Options().insertString(f"-pc_tt_rank 100 -pc_tt_precision {precision}")
+    PETSc.Options()["pc_tt_rank"] = "100"
     pc = PETSc.PC().create(mat.comm)
     pc.setOperators(mat)
     pc.setType("python")
     pc.setPythonType("pctt.pc.TensorTrain")
     pc.setFromOptions()
+    context = pc.getPythonContext()
+    context.options = replace(context.options, precision=precision)
     pc.setUp()
     return pc
 

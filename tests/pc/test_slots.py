@@ -129,15 +129,15 @@ def test_rows_of_the_same_name_never_share_a_slot():
     assert not follow(slots, points, keys)
 
 
-@pytest.mark.parametrize("scaling", ["block", "none"])
+@pytest.mark.parametrize("variant", ["own", "unscaled"])
 @pytest.mark.parametrize("block", [1, 3])
-def test_empty_slots_leave_the_preconditioner_as_it_is(block, scaling):
+def test_empty_slots_leave_the_preconditioner_as_it_is(block, variant):
     """With full ranks the train is the inverse, whether there are empty slots or not."""
     points, keys = cloud(40)
     identity = np.eye(40 * block)
     for names in (keys, None):
         mat = springs(points, names, block)
-        ksp = ready(mat, rank=400, eps=1e-12, scaling=scaling)
+        ksp = ready(mat, rank=400, eps=1e-12, variant=variant)
         pc = context(ksp)
         assert pc.rank == 400, pc.account.fallbacks
         assert (pc.made.slots.size > 40) == (names is not None)
@@ -161,7 +161,7 @@ def follow_up(ksp: PETSc.KSP, mat: PETSc.Mat) -> None:
     ksp.setUp()
 
 
-@pytest.mark.parametrize(("reuse", "reused"), [("none", 0), ("newton", 0), ("steps", 1), ("trains", 0)])
+@pytest.mark.parametrize(("reuse", "reused"), [("none", 0), ("cores", 1), ("trains", 0)])
 def test_reuse_goes_as_far_as_asked(reuse, reused):
     """A warm start is no worse than a cold one."""
     first, second = contact_steps(1000)
@@ -173,7 +173,7 @@ def test_reuse_goes_as_far_as_asked(reuse, reused):
     assert (made.inverse is opening) == (account.kept == 1) == (reuse == "trains")
     assert (made.hierarchy is None) == (reuse == "trains")  # block pairs are not listed for nothing
     cold = ready(second, rank=8)
-    if reuse == "steps":
+    if reuse == "cores":
         assert made.compression.passes < compression.passes
         assert made.compression.error <= 1.02 * context(cold).made.compression.error
         assert made.inverse.residual <= 1.5 * context(cold).made.inverse.residual
@@ -183,7 +183,7 @@ def test_reuse_goes_as_far_as_asked(reuse, reused):
 
 
 def test_an_overflow_makes_a_new_tree():
-    ksp = ready(springs(*cloud(600)), rank=4)
+    ksp = ready(springs(*cloud(600)), rank=4, reuse="cores")
     follow_up(ksp, springs(*cloud(800)))
     assert (context(ksp).account.resets, context(ksp).account.reused) == (1, 0)
     assert context(ksp).made.slots.size >= 800
@@ -208,7 +208,7 @@ def test_rows_that_change_ranks(ranks):
         return mat
 
     everything = np.arange(n * n)
-    ksp = solver(matrix(everything[:-8], 0), rank=6, reuse="steps")
+    ksp = solver(matrix(everything[:-8], 0), rank=6, reuse="cores")
     solve(ksp)
     pc = context(ksp)
     for offset, keep in ((3, everything[4:-4]), (-3, everything[8:]), (n**3, everything)):  # n^3: all on the first rank

@@ -222,7 +222,7 @@ def test_options_of_newton_systems_that_have_an_effect_are_not_named(solver, pro
     options = ("-ksp_rtol", 1e-2, "-ksp_max_it", 300, "-ksp_norm_type", "unpreconditioned")
     if solver == "pdip":
         options += ("-compare", "ilu,tt", "-compare_every", 2)
-        options += ("-compare_ilu_pc_factor_levels", 1, "-compare_tt_pc_tt_max_rank", 2)
+        options += ("-compare_ilu_pc_factor_levels", 1, "-compare_tt_pc_tt_rank", 2)
     else:
         options += ("-ksp_type", "cg", "-law", "relaxation")  # else the few contacts have factors without a KSP
     done = program(*SETTLED, "-steps", 2, "-ccp_type", solver, *options)

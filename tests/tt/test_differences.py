@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pctt.tt import differences as of
+from pctt.tt.conjugate import ConjugateGradients, iterations, race
 
 SHAPES = st.lists(st.integers(1, 6), min_size=1, max_size=3).map(tuple)
 
@@ -19,41 +20,143 @@ def basis(n: int, kind: str) -> np.ndarray:
     return Q / np.linalg.norm(Q, axis=1)[:, None]
 
 
-def dense(differences: np.ndarray) -> np.ndarray:
-    x = np.array(np.unravel_index(np.arange(differences.size), differences.shape))
-    return differences[tuple(abs(x[:, :, None] - x[:, None, :]))]
+def dense(a: of.Differences) -> np.ndarray:
+    x = np.array(np.unravel_index(np.arange(np.prod(a.shape)), a.shape))
+    apart = x[:, :, None] - x[:, None, :]
+    values = a.values[tuple(abs(apart) if a.even else apart)]
+    return values.transpose(0, 2, 1, 3).reshape(2 * [values.shape[0] * a.block])
 
 
-@given(SHAPES, st.sampled_from(of.KINDS), st.integers(0, 9))
-def test_eigenvalues_and_inverse_are_those_of_the_nearest_matrix(shape: tuple[int, ...], kind: str, seed: int) -> None:
+def some(shape: tuple[int, ...], block: int, even: bool, seed: int) -> of.Differences:
+    """Random, symmetric, and diagonally dominant, so positive definite."""
     rng = np.random.default_rng(seed)
-    a = rng.standard_normal(shape)
-    a.flat[0] += 10 * np.abs(a).sum()  # diagonally dominant, so positive definite
+    a = of.Differences(shape, rng.standard_normal((*(shape if even else [2 * n - 1 for n in shape]), block, block)))
+    values = 0.5 * (a.values + a.transposed.values)
+    values[(0,) * len(shape)] += 4 ** len(shape) * np.abs(values).sum() * np.eye(block)
+    return of.Differences(shape, values)
+
+
+@given(SHAPES, st.sampled_from(["cosine", "sine"]), st.integers(1, 3), st.booleans(), st.integers(0, 9))
+def test_eigenvalues_and_inverse_are_those_of_the_nearest_matrix(
+    shape: tuple[int, ...], kind: str, block: int, even: bool, seed: int
+) -> None:
+    a = some(shape, block, even, seed)
     A, Q = dense(a), np.ones((1, 1))
     for n in shape:
         Q = np.kron(Q, basis(n, kind))
-    values = np.diag(Q @ A @ Q.T)
-    np.testing.assert_allclose(of.eigenvalues(a, kind).ravel(), values, rtol=1e-10)
-    v = rng.standard_normal(len(A))
-    transform = of.FastTransform(a, float(kind == "cosine"))
-    assert transform.positive
-    np.testing.assert_allclose(transform.solve(v), Q.T @ ((Q @ v) / values), atol=1e-10)
-    both = 0.75 * of.FastTransform(a, 1.0).solve(v) + 0.25 * of.FastTransform(a, 0.0).solve(v)
-    np.testing.assert_allclose(of.FastTransform(a, 0.75).solve(v), both)
-    np.testing.assert_allclose(of.product(a)(v), A @ v, atol=1e-9 * a.flat[0])
+    Q = np.kron(Q, np.eye(block))
+    nearest = Q @ A @ Q.T * np.kron(np.eye(len(A) // block), np.ones((block, block)))
+    k = np.arange(len(A) // block)
+    blocks = nearest.reshape(len(k), block, len(k), block)[k, :, k]
+    np.testing.assert_allclose(of.eigenvalues(a, kind)[0].reshape(blocks.shape), blocks, atol=1e-10 * A[0, 0])
+    v = np.random.default_rng(seed).standard_normal((2, len(A)))
+    inverse = of.FastInverse(a, ((kind, 1.0),))
+    assert inverse.positive
+    np.testing.assert_allclose(inverse.solve(v), v @ Q.T @ np.linalg.inv(nearest) @ Q, atol=1e-9 / A[0, 0])
+    both = 0.75 * of.FastInverse(a, (("cosine", 1.0),)).solve(v) + 0.25 * of.FastInverse(a, (("sine", 1.0),)).solve(v)
+    np.testing.assert_allclose(of.FastInverse(a, (("cosine", 0.75), ("sine", 0.25))).solve(v), both)
+    np.testing.assert_allclose(a.times(v), v @ A.T, atol=1e-9 * A[0, 0])
+
+
+@given(SHAPES, st.integers(1, 3), st.booleans(), st.integers(0, 9))
+def test_circulants_are_the_nearest_and_a_part_of_a_wider_inverse(
+    shape: tuple[int, ...], block: int, even: bool, seed: int
+) -> None:
+    a = some(shape, block, even, seed)
+    A, v = dense(a), np.random.default_rng(seed).standard_normal((2, np.prod(shape) * block))
+    x = np.array(np.unravel_index(np.arange(np.prod(shape)), shape))
+    apart = np.ravel_multi_index((x[:, :, None] - x[:, None, :]) % np.array(shape)[:, None, None], shape)
+    blocks = A.reshape(len(apart), block, len(apart), block).transpose(0, 2, 1, 3).copy()
+    for s in range(len(apart)):  # the mean over all pairs whose difference is the same up to the period
+        blocks[apart == s] = blocks[apart == s].mean(axis=0)
+    C = blocks.transpose(0, 2, 1, 3).reshape(A.shape)
+    np.testing.assert_allclose(of.FastInverse(a, of.CIRCULANT).solve(v), v @ np.linalg.inv(C), atol=1e-9 / A[0, 0])
+    wide = of.Differences(shape, a.wide())
+    m = wide.values.shape[:-2]
+    padded = np.zeros((2, *m, block))
+    padded[(..., *map(slice, shape), slice(None))] = v.reshape(2, *shape, block)
+    y = np.array(np.unravel_index(np.arange(np.prod(m)), m))
+    W = wide.values[tuple((y[:, :, None] - y[:, None, :]) % np.array(m)[:, None, None])]
+    W = W.transpose(0, 2, 1, 3).reshape(2 * [len(y[0]) * block])
+    values, vectors = np.linalg.eigh(W)
+    values = np.maximum(values, np.linalg.eigvalsh(C)[0])  # it need not be positive
+    left = (padded.reshape(2, -1) @ (vectors / values) @ vectors.T).reshape(padded.shape)
+    left = left[(..., *map(slice, shape), slice(None))]
+    found = of.FastInverse(a, (("embedding", 1.0),)).solve(v)
+    np.testing.assert_allclose(found, left.reshape(v.shape), atol=1e-9 / A[0, 0])
+
+
+def offsets(*shape: int) -> np.ndarray:
+    """All differences of a grid (D, 2 n_1 - 1, ...)."""
+    return np.array(np.meshgrid(*[np.concatenate([np.arange(n), np.arange(1 - n, 0)]) for n in shape], indexing="ij"))
+
+
+def kernel(values: np.ndarray, nugget: float) -> of.Differences:
+    shape = tuple((m + 1) // 2 for m in values.shape)
+    values = values.copy()
+    values[(0,) * len(shape)] += nugget
+    return of.Differences(shape, values[..., None, None]).compact()
+
+
+def count(a: of.Differences, kind: of.Kind) -> int:
+    """Iterations to 1e-8."""
+    inverse, b = of.FastInverse(a, kind), np.random.default_rng(1).standard_normal(np.prod(a.shape) * a.block)
+    run = ConjugateGradients(a.times, b, inverse.solve)
+    while run.norms[-1] > 1e-8 * run.norms[0] and len(run.norms) < 1000:
+        run.step()
+    return len(run.norms) - 1
+
+
+x, y = offsets(48, 40)
+turned = np.hypot((0.8 * x + 0.6 * y) / 9, (0.8 * y - 0.6 * x) / 2)
+KERNELS = {
+    "exponential": np.exp(-np.hypot(x, y) / 10), "turned": np.exp(-turned), "turned Gauss": np.exp(-(turned**2)),
+    "waves": np.cos(0.5 * x) * np.cos(0.5 * y), "season": np.exp(-abs(x) / 8 - 2 * np.sin(np.pi * y / 8) ** 2),
+    "periodic": np.exp(-np.minimum(abs(x), 48 - abs(x)) / 5 - np.minimum(abs(y), 40 - abs(y)) / 9),
+    "band": np.sinc(0.2 * x) * np.sinc(0.15 * y), "moving": np.exp(-np.hypot((x - 0.8 * y) / 6, y / 12)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize("points", [4096, 256])
+def test_the_choice_is_no_worse_than_nothing_and_a_circulant(name, points, monkeypatch) -> None:
+    """On parts of 256 points too, which do not show all of the kernel."""
+    monkeypatch.setattr(of, "POINTS", points)
+    a = kernel(KERNELS[name], 0.02)
+    kind = of.choose(a).kind
+    assert count(a, kind) <= 1.3 * min(count(a, of.NOTHING), count(a, of.CIRCULANT))
+    if name == "exponential":
+        assert count(a, kind) <= 0.4 * count(a, of.CIRCULANT)
 
 
 def test_the_best_share_is_chosen() -> None:
-    i = np.arange(48)
-    squares = i[:, None] ** 2 + i**2
-    smooth = np.exp(-np.sqrt(squares) / 10)
-    smooth[0, 0] += 0.01
-    assert of.best(smooth)[0] == 1
     t = 2 - 2 * np.cos(2 * np.pi * np.arange(512) / 512)
     fractional = np.fft.irfft2((t[:, None] + t[:257]) ** 0.7)[:48, :48]
-    assert of.best(fractional)[0] == 0
+    assert of.choose(of.Differences.of_even(fractional)).kind == (("sine", 1.0),)
 
 
 @pytest.mark.parametrize("a", [[1.0, 2.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0]])
 def test_a_matrix_that_is_not_positive_has_none(a: list[float]) -> None:
-    assert of.best(np.array(a)) is None
+    assert of.choose(of.Differences.of_even(np.array(a))) is None
+
+
+def test_a_race_is_won_by_the_cheapest_and_never_by_one_that_has_not_arrived() -> None:
+    A, b = np.diag(np.linspace(1, 100, 60)), np.ones(60)
+    exact, nothing = (lambda r: r / np.diag(A)), None
+    spoilt = lambda r: np.linspace(1, 1e4, 60) * r  # noqa: E731
+
+    def runs(*solves, each=0.0):
+        return [ConjugateGradients(lambda x: A @ x, b, solve, each) for solve in solves]
+
+    first, second, third = race(runs(nothing, exact, spoilt), 2.0, 50.0)
+    assert (first, second, third) == (np.inf, 1.0, np.inf)
+    dear = runs(nothing, exact)
+    dear[1].each = 1000.0
+    assert race(dear, 2.0, 500.0)[0] < race(dear, 2.0, 2000.0)[1]
+    negative = runs(lambda r: -r, nothing)
+    assert race(negative, 2.0, 100.0)[0] == np.inf
+
+
+def test_iterations_are_extrapolated_from_digits() -> None:
+    assert iterations([1.0, 1e-2, 1e-4], 8) == 4
+    assert iterations([1.0, 1.0], 8) == np.inf

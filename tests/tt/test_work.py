@@ -17,19 +17,26 @@ def smooth(i: np.ndarray, j: np.ndarray) -> np.ndarray:
 def test_a_limit_ends_compression_and_inversion_at_the_same_place() -> None:
     spent: list[float] = []
 
-    def both(work: Work) -> None:
+    def both(work: Work) -> tt.Inverse:
         found = tt.compress_cross(tt.EntryMatrix(smooth, tt.GridDigits((256,))), 40, 1e-6, work=work)
         spent.append(work.spent)
         assert work.spent > 200 * found.evaluations * 0.99
-        assert invert_near_identity(found.train.symmetric_part(1e-8), 40, eps=1e-6, work=work).residual <= 1e-6
+        inverse = invert_near_identity(found.train.symmetric_part(1e-8), 40, eps=1e-6, work=work)
         spent.append(work.spent)
+        return inverse
 
-    both(Work())
+    assert both(Work()).residual <= 1e-6
     both(Work())
     compression, whole, *again = spent
     assert again == [compression, whole]
-    for limit, phase in ((0.5 * compression, "the compression"), (0.5 * (compression + whole), "the inversion")):
+    inversion = whole - compression
+    for limit, phase in ((0.5 * compression, "the compression"), (compression + 0.02 * inversion, "the inversion")):
         work = Work(limit)
         with pytest.raises(TooMuchWorkError, match=phase):
             both(work)
         assert work.spent < 2 * whole
+    work = Work(compression + 0.25 * inversion)  # the result of the last whole sweep
+    found = both(work)
+    assert "the inversion, at rank" in found.stopped
+    assert 1e-6 < found.residual < 0.5
+    assert work.spent < whole

@@ -75,7 +75,8 @@ class Krylov:
 
     def __init__(self, comm: MPI.Comm, prefix: str = OWN, defaults: dict[str, str] | None = None, rtol: float = 1e-3):
         self.comm, self.prefix = comm, prefix
-        self._options, self._sources = to_enter(prefix, defaults or {}, comm.size)
+        similar = {"pc_tt_reuse": "trains"}  # the matrices are alike
+        self._options, self._sources = to_enter(prefix, similar | (defaults or {}), comm.size)
         self.ksp = PETSc.KSP().create(comm)
         self.ksp.setOptionsPrefix(prefix)
         self.ksp.setTolerances(rtol=rtol, atol=1e-300, max_it=1000)
