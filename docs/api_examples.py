@@ -486,7 +486,9 @@ for _ in range(3):
     contacts = find_contacts(world, delta=0.02, dt=dt)
     system = ContactSystem(world, contacts, dt, recovery_speed=1.0)
     problem = ccp.ConeProblem(world.comm, system.r, system.mu, G=system.contact_map)
-    result = ccp.solve(problem, memory.recall(contacts.key, system.frame)[0], "apgd", ccp.Limits(tol=1e-8))
+    result = ccp.solve(
+        problem, memory.recall(contacts.key, system.frame)[0], "apgd", ccp.Limits(tol=1e-8), law=ccp.RELAXATION
+    )
     memory.remember(contacts.key, result.impulse, system.frame)
     step = Step(world, contacts, system, result.impulse)
     print(len(contacts.gap), "contacts, the floor bears", round(-step.force_on("floor")[2], 3), "N")
@@ -518,10 +520,24 @@ from pctt import ccp
 # one contact of a mass of 2 kg that slides at 3 m/s and falls at 1 m/s: the impulses that stop the fall
 N = PETSc.Mat().createDense((3, 3), array=np.eye(3) / 2.0, comm=MPI.COMM_SELF)
 problem = ccp.ConeProblem(MPI.COMM_SELF, r=np.array([[-1.0, 3.0, 0.0]]), mu=np.array([0.5]), N=N)
-result = ccp.solve(problem, type="apgd", limits=ccp.Limits(tol=1e-10), law=ccp.COULOMB)
+result = ccp.solve(problem, limits=ccp.Limits(tol=1e-10))
 print(result.status, "after", result.iterations, "iterations:", result.impulse.round(6), "N s")
 accuracy = ccp.measure(problem, result.impulse)
 print("Coulomb residual", f"{accuracy.coulomb_residual:.0e}", "closing work", f"{accuracy.closing_work:.0e}")
+
+# %% pctt.ccp.Operator
+import numpy as np
+from mpi4py import MPI
+
+from pctt import ccp
+
+# eight contacts in a row on an elastic ground: what one is pressed with moves all, the less the farther they are
+distance = np.abs(np.subtract.outer(np.arange(8), np.arange(8)))
+near = 1.0 / (1.0 + distance**2)
+N = ccp.Operator(mult=lambda g: near @ g, blocks=np.tile(np.eye(3), (8, 1, 1)))
+problem = ccp.ConeProblem(MPI.COMM_SELF, r=np.tile([-1.0, 0.3, 0.0], (8, 1)), mu=np.full(8, 0.3), N=N)
+result = ccp.solve(problem)
+print(result.status, "with pressures", result.impulse[:, 0].round(3))
 
 # %% pctt.ccp.RollingProblem, dem.contact_map.TurningMap
 from mpi4py import MPI
@@ -550,7 +566,7 @@ N = PETSc.Mat().createDense((60, 60), array=A @ A.T, comm=comm)
 problem = ccp.ConeProblem(comm, rng.standard_normal((20, 3)), np.full(20, 0.5), N=N)
 compare = ccp.Comparison(comm, ["none", "jacobi"])
 newton = ccp.newton_for(comm, "pdip", compare=compare)
-result = ccp.solve(problem, type="pdip", newton=newton)
+result = ccp.solve(problem, type="pdip", newton=newton, law=ccp.RELAXATION)
 print(result.status, "after", result.newton_its, "Newton systems of the form", newton.form)
 for name, figures in compare.summary().items():
     print(name, "solved", figures["converged"], "of", figures["systems"], "systems")
@@ -568,7 +584,7 @@ block = np.zeros((3, 6))
 block[[0, 1, 2], [2, 0, 1]] = 1 / np.sqrt(2.0)  # rows normal, t1, t2 of D' M^-1/2
 rows = BlockRows(indptr=np.array([0, 1]), indices=np.array([0]), blocks=block[None], columns=1)
 problem = ccp.ConeProblem(MPI.COMM_SELF, r=np.array([[-0.1, 0.02, 0.0]]), mu=np.array([0.5]), G=rows)
-print("impulse that stops it:", ccp.solve(problem, type="conic").impulse.round(4), "N s")
+print("impulse that stops it:", ccp.solve(problem, type="conic", law=ccp.RELAXATION).impulse.round(4), "N s")
 
 # %% pctt.ccp.fclib.Info, pctt.ccp.fclib.Solution, pctt.ccp.fclib.Stored
 import numpy as np
@@ -580,7 +596,7 @@ from pctt.ccp import fclib
 
 N = PETSc.Mat().createDense((3, 3), array=np.eye(3), comm=MPI.COMM_SELF)
 problem = ccp.ConeProblem(MPI.COMM_SELF, np.array([[-1.0, 0.2, 0.0]]), np.array([0.5]), N=N)
-result = ccp.solve(problem, type="apgd")
+result = ccp.solve(problem, type="apgd", law=ccp.RELAXATION)
 solution = fclib.Solution(r=result.impulse, u=problem.product(result.impulse) + problem.r)
 fclib.write_local("one.hdf5", problem, fclib.Info("one contact"), solution=solution)
 stored = fclib.load("one.hdf5", MPI.COMM_SELF)

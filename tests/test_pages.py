@@ -110,9 +110,19 @@ def test_the_program_of_the_readme_solves_by_a_train(in_folder, capfd):
 def test_the_cone_problem_of_its_page_is_solved(in_folder, capsys):
     stored_problem(in_folder / "problem.hdf5")
     names: dict[str, Any] = {}
-    exec(blocks("docs/ccp.md")[0], names)
+    exec(blocks("docs/ccp.md")[1], names)
     assert names["result"].converged
     assert "natural residual and closing work below the tolerance" in capsys.readouterr().out
+
+
+def test_a_cone_problem_handed_over(capsys):
+    names: dict[str, Any] = {}
+    exec(blocks("docs/ccp.md")[0], names)
+    result, K = names["result"], names["K"].toarray()
+    moved = names["r"].ravel() + np.linalg.solve(K, result.impulse.ravel())
+    assert result.velocity.ravel() == pytest.approx(moved, abs=1e-12)
+    assert result.velocity[:, 0].min() > -1e-3
+    assert "status      converged" in capsys.readouterr().out
 
 
 def test_poisson_with_a_train(in_folder, capfd):

@@ -8,23 +8,27 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows
 from dem.exchange import refuse
-from pctt.ccp.accuracy import Accuracy, measure
-from pctt.ccp.cone import Array
+from pctt.ccp.accuracy import Accuracy, figures, measure
+from pctt.ccp.cone import Array, tangential
 from pctt.ccp.coulomb import fixed_point
+from pctt.ccp.door import Operator
 from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.registry import NEWTON, SOLVERS, why_no_form, why_refused
-from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Limits, Result, Status
+from pctt.ccp.registry import MATRIX, NEWTON, SOLVERS, why_no_form, why_refused
+from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Counts, Limits, Result, Status
 from pctt.ccp.rolling import RollingProblem
-from pctt.ccp.unbounded import why_unbounded
+from pctt.ccp.unbounded import why_unanswered, why_unbounded
 from pctt.log import phase
 
 __all__ = [
@@ -41,6 +45,7 @@ __all__ = [
     "ConeProblem",
     "Limits",
     "Newton",
+    "Operator",
     "Result",
     "RollingProblem",
     "Status",
@@ -53,13 +58,14 @@ __all__ = [
 def solve(
     problem: ConeProblem,
     guess: Array | None = None,
-    type: str = "pdip",
+    type: str = "auto",
     limits: Limits | None = None,
     options: Any = None,
     newton: Newton | None = None,
-    law: str = RELAXATION,
+    law: str = COULOMB,
+    monitor: Callable[[int, float], None] | None = None,
 ) -> Result:
-    """Solve a cone problem by a method of SOLVERS; with the ``law`` COULOMB find impulses of Coulomb's law.
+    """Find impulses of Coulomb's law by a method of SOLVERS; with the ``law`` RELAXATION solve the cone problem.
 
     Where the method does not solve it, one other goes on from its impulses, with its own limit of iterations: `apgd`,
     or `conic` after `apgd`. If that does not solve it either, the result is the one with the smaller residual, and its
@@ -68,11 +74,13 @@ def solve(
     Coulomb's law is found by the method itself if it can (`Solver.has_law`), else by a sequence of cone problems
     (`pctt.ccp.coulomb`).
 
-    A `RollingProblem`, whose impulses are (2 nc, 3), is for `conic`, `apgd` and `auto`.
+    A `RollingProblem`, whose impulses are (2 nc, 3), is for `conic`, `apgd` and `auto`. A problem given by a
+    `pctt.ccp.Operator` is for all methods but `gauss_seidel`; ValueError for a preconditioner that reads entries.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
     the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
-    from one problem to the next. A problem without a solution has the status UNBOUNDED.
+    from one problem to the next; ``monitor(iterations, residual)`` is called wherever the residual is known, on every
+    rank. A problem without a solution has the status UNBOUNDED.
     """
     if type not in SOLVERS:
         raise ValueError(f"the solver {type!r}: allowed are {', '.join(SOLVERS)}")
@@ -84,7 +92,12 @@ def solve(
     if rolls and newton is not None and newton.form != "body":
         raise ValueError(f"the Newton form {newton.form!r}: with rolling or spinning resistance allowed is body")
     _refuse_form(type, newton.form if newton is not None else "")
+    if not problem.has_entries and SOLVERS[type].needs == MATRIX:
+        allowed = ", ".join(name for name, method in SOLVERS.items() if method.needs != MATRIX)
+        raise ValueError(f"the solver {type!r} reads rows of N, but N is given by its products; allowed are {allowed}")
     limits = limits or Limits()
+    if monitor is not None or limits.monitor:
+        limits = dataclasses.replace(limits, watch=monitor or partial(_print, problem.comm))
     if not limits.tol > 0.0:
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
     result = asked = _by(type, problem, _start(problem, guess), limits, options, newton, law)
@@ -92,10 +105,13 @@ def solve(
     wrong = asked.status is Status.BREAKDOWN and other == "conic"  # products are no numbers
     hopeless = asked.final or asked.exhausted or wrong
     if limits.fallback and not hopeless:
-        second = _by(other, problem, asked.impulse, dataclasses.replace(limits, max_it=-1), None, newton, law)
+        rest = dataclasses.replace(limits.after(asked.iterations), max_it=-1)
+        second = _by(other, problem, asked.impulse, rest, None, newton, law)
         better = second.final or second.residual < asked.residual
         result = second.after(asked) if better else dataclasses.replace(asked).after(second)
         result.asked, result.reason = asked, f"{type}: {asked.reason}; {other}: {second.reason}"
+    for each in (result,) if result.asked is None else (result, result.asked):
+        each.impulse = problem.shown(each.impulse)
     return result
 
 
@@ -110,19 +126,28 @@ def _by(
         result = Result(nothing, Status.CONVERGED, words, 0.0, 0, solver=name, law=law)
         _measure(problem, result)
         return result
+    if words := why_unanswered(problem, coulomb):
+        result = Result(nothing, Status.UNBOUNDED, words, cold, 0, solver=name, law=law)
+        _measure(problem, result)
+        return result
     limits = dataclasses.replace(limits, max_it=method.iterations) if limits.max_it < 0 else limits
     own = newton_for(problem.comm, name) if method.newton and newton is None else None
-    given = (options or method.options(), *([newton or own] if method.newton else []))
+    systems = newton or own if method.newton else None
+    if systems is not None:
+        systems.check(problem)
+    given = (options or method.options(), *([] if systems is None else [systems]))
 
     def run(guess: Array, limits: Limits, **law: bool) -> Result:
         return method.function(problem, guess, limits, *given, **law)
 
     try:
         with phase("CCPSolve"):
-            if coulomb and not method.has_law:
+            found = run(guess, limits, coulomb=True) if coulomb and method.has_law else None
+            # conic's own systems of Coulomb's law are those of bodies, or of few contacts
+            if coulomb and (found is None or (found.status is Status.GIVEN_UP and problem.contact_map is None)):
                 result = fixed_point(run, problem, guess, limits)
             else:
-                result = run(guess, limits, coulomb=True) if coulomb else run(guess, limits)
+                result = found or run(guess, limits)
                 result.law = law
     finally:
         if own is not None:
@@ -142,21 +167,42 @@ def _by(
 
 
 def _measure(problem: ConeProblem, result: Result) -> Accuracy:
-    """Tell the result what its impulses do to the bodies, and how accurate they are."""
+    """Tell the result what its impulses do to the bodies and the contacts, and how accurate they are."""
     result.momentum = problem.momentum(result.impulse)
-    result.accuracy = measure(problem, result.impulse, result.momentum)
+    rigid = problem.velocity_of(result.momentum)
+    y = rigid + problem.compliance * result.impulse + problem.r
+    result.velocity = y if problem.units is None else problem.velocities_by(result.impulse)
+    result.counts = _counts(problem, result.impulse, y, result.law != RELAXATION)
+    result.accuracy = figures(problem, result.impulse, rigid)
     return result.accuracy
 
 
+def _counts(problem: ConeProblem, g: Array, y: Array, coulomb: bool) -> Counts:
+    """How many contacts are open, slide and stick: of each two numbers that are complementary, impulses in units of
+    velocities, the larger one decides. Collective."""
+    nc, d, cones = problem.cones.count, problem.diagonal, problem.cones
+    opening = y[:nc, 0] if coulomb else y[:nc, 0] - cones.resisted(y)
+    open_ = d[:nc, 0] * g[:nc, 0] <= opening
+    room = 0.5 * (d[:nc, 1] + d[:nc, 2]) * (problem.mu[:nc] * g[:nc, 0] - tangential(g[:nc]))
+    slides = ~open_ & (room < tangential(y[:nc]))
+    opened, sliding = map(int, problem.sum(np.array([open_.sum(), slides.sum()])))
+    return Counts(opened, sliding, problem.size - opened - sliding)
+
+
+def _print(comm: MPI.Comm, iterations: int, residual: float) -> None:
+    PETSc.Sys.Print(f"{iterations:5d} residual {residual:.6e}", comm=comm)
+
+
 def _start(problem: ConeProblem, guess: Array | None) -> Array:
-    """The guess as an array (nc, 3) of float64, zero without one; ValueError on all ranks for another shape or if it is
-    no number."""
-    start = np.zeros_like(problem.r) if guess is None else np.ascontiguousarray(guess, dtype=float)
+    """The guess in the cones (nc, 3), zero without one; ValueError on all ranks for another shape or if it is no
+    number."""
+    none = np.zeros_like(problem.r)
+    start = problem.shown(none) if guess is None else np.ascontiguousarray(guess, dtype=float)
     wrong = "" if np.isfinite(start).all() else "a guess with a NaN or an infinite number"
-    if start.shape != problem.r.shape:
-        wrong = f"a guess of shape {start.shape}; allowed is {problem.r.shape}"
+    if start.shape != problem.shown(none).shape:
+        wrong = f"a guess of shape {start.shape}; allowed is {problem.shown(none).shape}"
     refuse(problem.comm, wrong)
-    return start
+    return problem.in_cones(start)
 
 
 def newton_for(comm: MPI.Comm, type: str, form: str = "auto", compare: Comparison | None = None) -> Newton:

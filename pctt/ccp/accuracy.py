@@ -53,11 +53,15 @@ class Accuracy:
     velocity_norm: float
 
 
-def measure(problem: ConeProblem, g: Array, momentum: Array | None = None) -> Accuracy:
-    """The figures of an impulse g (nc, 3), the same on every rank; ``momentum`` is that of `ConeProblem.momentum`, if
-    it is known."""
+def measure(problem: ConeProblem, impulse: Array) -> Accuracy:
+    """The figures of an impulse (nc, 3), or (nc, 2) in the plane; the same on every rank."""
+    g = problem.in_cones(impulse)
+    return figures(problem, g, problem.velocity_of(problem.momentum(g)))
+
+
+def figures(problem: ConeProblem, g: Array, rigid: Array) -> Accuracy:
+    """Those of an impulse g (nc, 3) in the cones, whose velocities are ``rigid`` without compliance and r."""
     step = 1.0 / problem.mean_diagonal
-    rigid = problem.velocity_of(problem.momentum(g) if momentum is None else momentum)
     if isinstance(problem, RollingProblem):
         sums, greatest = _judged_rolling(problem, g, rigid + problem.compliance * g + problem.r, step)
     else:

@@ -110,12 +110,12 @@ class Attempts:
         return result
 
     def apgd(self, guess: Array, most: int, options: apgd.APGD = USUAL, spare: int = 0) -> Result:
-        limits = replace(self.limits, max_it=min(most, self.limits.max_it), spare=spare)
+        limits = replace(self.rest, max_it=min(most, self.limits.max_it), spare=spare)
         return self.keep(apgd.solve(self.problem, guess, limits, options, coulomb=self.coulomb), "apgd")
 
     def conic(self, guess: Array, options: conic.Conic, basin: float = 0.0) -> Result:
         """To the limits, or to the ``basin`` of the residual alone."""
-        limits = replace(self.limits, max_it=self.most)
+        limits = replace(self.rest, max_it=self.most)
         if basin:
             limits = replace(limits, tol=basin, closing_work=np.inf, closing_speed=np.inf)
         given = self.problem, guess, limits, options, self.newton
@@ -123,12 +123,17 @@ class Attempts:
 
     def beyond(self, guess: Array, few: bool) -> None:
         """To the aim of limits that APGD has met: few contacts by the conic method, many by APGD."""
-        given = guess, replace(self.limits, max_it=self.most), conic.Conic(), self.newton
+        given = guess, replace(self.rest, max_it=self.most), conic.Conic(), self.newton
         if few or gathered.takes(self.problem, self.newton):
             method = conic if few else gathered
             self.keep(method.solve(self.problem, *given, coulomb=self.coulomb), "conic")
         if self.best.residual > self.limits.aimed and self.limits.spare:
             self.apgd(self.best.impulse, self.limits.max_it, spare=self.limits.spare)
+
+    @property
+    def rest(self) -> Limits:
+        """The limits of the next attempt."""
+        return self.limits.after(sum(result.iterations for result in self.all))
 
     @property
     def best(self) -> Result:
@@ -146,8 +151,8 @@ class Attempts:
                 return
         problem = self.problem
         by_conic = partial(conic.solve, problem, options=conic.Conic(), newton=self.newton)
-        limits = replace(self.limits, max_it=self.most)
-        relaxed = by_conic(guess=np.zeros_like(problem.r), limits=limits)
+        limits = replace(self.rest, max_it=self.most)
+        relaxed = by_conic(guess=np.zeros_like(problem.r), limits=limits.unwatched)
         if why := why_unbounded(problem, relaxed.impulse):
             self.keep(replace(relaxed, status=Status.UNBOUNDED, reason=f"of the relaxation, {why}"), "conic")
             return

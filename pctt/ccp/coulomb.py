@@ -59,12 +59,13 @@ def fixed_point(
     while len(history) < options.max_it:
         problem.r = r + np.stack([s, 0 * s, 0 * s], axis=1)
         try:
-            inner = convex(g, limits.to(accuracy)).after(*spent)
+            inner = convex(g, limits.to(accuracy).unwatched).after(*spent)
         finally:
             problem.r = r
         g, spent = inner.impulse, [inner]
         y = problem.product(g) + r
         history.append(limits.residual(problem.errors(g, y, coulomb=True)))
+        limits.tell(inner.iterations, history[-1])
         best = inner if history[-1] <= min(history) else best
         failed = 0 if inner.converged else failed + 1
         if history[-1] <= tol or failed > 1 or inner.status is Status.UNBOUNDED:
@@ -108,6 +109,8 @@ class Anderson:
             return best
         changes = np.stack([df for _, df in self._steps])
         normal, right = self.problem.sum(changes @ changes.T), self.problem.sum(changes @ f)
+        if not (np.isfinite(normal).all() and np.isfinite(right).all()):
+            return best
         shares = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
         for share, (ds, df) in zip(shares, self._steps):
             best = best - share * (ds + self.relaxation * df)

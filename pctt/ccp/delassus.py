@@ -7,6 +7,7 @@ faster (n = 16, 134,547 contacts, one core: 0.45 s against 1.4 s and a slow conv
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 
@@ -24,51 +25,37 @@ from pctt.blocks import Array, square_block_matrix
 HUB = 500  # a body with more contacts is a hub: its columns of G would fill N
 
 
-def rows_in_blocks(N: PETSc.Mat) -> sp.bsr_matrix:
-    """This rank's rows of a Mat of type AIJ, BAIJ, SBAIJ or dense in 3 x 3 blocks, their columns global."""
-    plain = N.getType() in ("seqaij", "mpiaij", "seqbaij", "mpibaij")
-    rows = N if plain else N.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
+def rows_of(mat: PETSc.Mat) -> sp.csr_matrix:
+    """This rank's rows of a Mat, their columns global; collective."""
+    plain = mat.getType() in ("seqaij", "mpiaij", "seqbaij", "mpibaij")
+    rows = mat if plain else mat.convert(PETSc.Mat.Type.AIJ, PETSc.Mat())
     indptr, indices, values = rows.getValuesCSR()
     if not plain:
         rows.destroy()
-    shape = (N.getLocalSize()[0], N.getSize()[1])
-    return sp.csr_matrix((values, indices, indptr), shape=shape).tobsr((3, 3))
+    return sp.csr_matrix((values, indices, indptr), shape=(mat.getLocalSize()[0], mat.getSize()[1]))
 
 
-class GivenMatrix:
-    """N itself, of a problem that knows no bodies, with the members of `ContactMap` that it can have: impulses take the
-    place of momenta, and N g that of the velocities of contacts; an image has both, of all contacts.
+def rows_in_blocks(N: PETSc.Mat) -> sp.bsr_matrix:
+    """This rank's rows of a Mat in 3 x 3 blocks, their columns global; collective."""
+    return rows_of(N).tobsr((3, 3))
 
-    local : this rank's rows in 3 x 3 blocks, their columns global. Of a Mat of type AIJ, BAIJ, SBAIJ or dense they are
-        a copy. ValueError on all ranks if they have a NaN or an infinite number
+
+class GivenOperator:
+    """N by its products, of a problem that knows no bodies, with the members of `ContactMap` that it can have: impulses
+    take the place of momenta, and N g that of the velocities of contacts; an image has both, of all contacts.
+
+    product : a function of impulses (nc, 3) that returns N g (nc, 3); collective
+    blocks : (nc, 3, 3) the diagonal blocks of N
     """
 
-    def __init__(self, comm: MPI.Comm, N: PETSc.Mat | sp.bsr_matrix):
-        self.local: sp.bsr_matrix = N if isinstance(N, sp.bsr_matrix) else rows_in_blocks(N)
-        if comm.allreduce(not np.isfinite(self.local.data).all(), MPI.LOR):
-            raise ValueError("N has a NaN or an infinite number")
-        self.comm, self.rows = comm, len(self.local.indptr) - 1
-        self._first = offsets(comm, self.rows)[comm.rank]
+    def __init__(self, comm: MPI.Comm, blocks: Array, product: Callable[[Array], Array] | None = None):
+        self.comm, self.rows, self._blocks, self._product = comm, len(blocks), blocks, product
         self._size: Array | None = None
-
-    @cached_property
-    def mat(self) -> PETSc.Mat:
-        """N as a Mat (BAIJ), built at its first use and kept; collective."""
-        return square_block_matrix(self.comm, self.local)
-
-    @cached_property
-    def _vectors(self) -> tuple[PETSc.Vec, PETSc.Vec]:
-        return self.mat.createVecs()
 
     def velocities(self, g: Array) -> Array:
         """N g (nc, 3)."""
-        g = shaped("impulses", g, self.rows, 3)
-        if self.comm.size == 1:
-            return _product(self.local.indptr, self.local.indices, self.local.data, np.ascontiguousarray(g, float))
-        g_of_mat, y = self._vectors
-        g_of_mat.array[:] = g.ravel()
-        self.mat.mult(g_of_mat, y)
-        return y.array.reshape(-1, 3).copy()
+        assert self._product is not None
+        return self._product(shaped("impulses", g, self.rows, 3))
 
     def momenta(self, g: Array) -> Array:
         """g (nc, 3)."""
@@ -97,13 +84,9 @@ class GivenMatrix:
 
     def contact_blocks(self) -> Array:
         """The diagonal blocks of N (nc, 3, 3)."""
-        row = np.repeat(np.arange(self.rows), np.diff(self.local.indptr))
-        near = self._first + row == self.local.indices
-        out = np.zeros((self.rows, 3, 3))
-        out[row[near]] = self.local.data[near]
-        return out
+        return self._blocks
 
-    def scaled(self, size: Array, precision: type[np.floating] = np.float64) -> GivenMatrix:
+    def scaled(self, size: Array, precision: type[np.floating] = np.float64) -> GivenOperator:
         """N with rows and columns multiplied by ``size`` (nc, 3), for products with impulses of this precision; it is
         valid until this object is destroyed."""
         other = copy.copy(self)
@@ -111,7 +94,49 @@ class GivenMatrix:
         return other
 
     def structure(self) -> tuple[np.ndarray, ...]:
-        """Arrays of this rank that are equal where the places of the blocks are."""
+        """Arrays of this rank that are equal where the places of the blocks are, of which there are none here."""
+        return (np.array([self.rows]),)
+
+    def destroy(self) -> None:
+        """Free the objects of PETSc."""
+
+
+class GivenMatrix(GivenOperator):
+    """N by its entries.
+
+    local : this rank's rows in 3 x 3 blocks, their columns global. Of a Mat they are a copy. ValueError on all ranks if
+        they have a NaN or an infinite number
+    """
+
+    def __init__(self, comm: MPI.Comm, N: PETSc.Mat | sp.bsr_matrix):
+        self.local: sp.bsr_matrix = N if isinstance(N, sp.bsr_matrix) else rows_in_blocks(N)
+        if comm.allreduce(not np.isfinite(self.local.data).all(), MPI.LOR):
+            raise ValueError("N has a NaN or an infinite number")
+        rows = len(self.local.indptr) - 1
+        row, first = np.repeat(np.arange(rows), np.diff(self.local.indptr)), offsets(comm, rows)[comm.rank]
+        near, blocks = first + row == self.local.indices, np.zeros((rows, 3, 3))
+        blocks[row[near]] = self.local.data[near]
+        super().__init__(comm, blocks)
+
+    @cached_property
+    def mat(self) -> PETSc.Mat:
+        """N as a Mat (BAIJ), built at its first use and kept; collective."""
+        return square_block_matrix(self.comm, self.local)
+
+    @cached_property
+    def _vectors(self) -> tuple[PETSc.Vec, PETSc.Vec]:
+        return self.mat.createVecs()
+
+    def velocities(self, g: Array) -> Array:
+        g = shaped("impulses", g, self.rows, 3)
+        if self.comm.size == 1:
+            return _product(self.local.indptr, self.local.indices, self.local.data, np.ascontiguousarray(g, float))
+        g_of_mat, y = self._vectors
+        g_of_mat.array[:] = g.ravel()
+        self.mat.mult(g_of_mat, y)
+        return y.array.reshape(-1, 3).copy()
+
+    def structure(self) -> tuple[np.ndarray, ...]:
         return self.local.indptr, self.local.indices
 
     def destroy(self) -> None:
@@ -192,12 +217,12 @@ class BlockMap(ContactMap):
     def contact_blocks(self) -> Array:
         """The diagonal blocks of G G' (nc, 3, 3)."""
         each = self.block_rows.blocks
-        return _sums(self._contact(), each @ each.transpose(0, 2, 1), self.rows)
+        return sums_of(self._contact(), each @ each.transpose(0, 2, 1), self.rows)
 
     def body_blocks(self, weight: Array) -> Array:
         """The diagonal blocks of I + G' H G (columns, 6, 6)."""
         each = self.block_rows.blocks
-        blocks = _sums(self._found[1], each.transpose(0, 2, 1) @ weight[self._contact()] @ each, self.halo.rows)
+        blocks = sums_of(self._found[1], each.transpose(0, 2, 1) @ weight[self._contact()] @ each, self.halo.rows)
         self.halo.add(blocks)
         return blocks[: self.columns] + np.eye(6)
 
@@ -213,6 +238,10 @@ class BlockMap(ContactMap):
     def _contact(self) -> np.ndarray:
         """The contacts of the blocks."""
         return np.repeat(np.arange(self.rows), np.diff(self.block_rows.indptr))
+
+
+class ColumnMap(BlockMap):
+    """The map of a matrix whose columns are any unknowns of the mass one: six of them in a block."""
 
 
 def without_hubs(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, bool]:
@@ -255,7 +284,7 @@ def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
         parts = exchange(comm, {"row": row, "column": columns, "block": N.data}, owner)
         row, columns = np.divmod(np.unique((parts["row"] - first) * total + parts["column"]), max(total, 1))
         place = np.searchsorted(row * total + columns, (parts["row"] - first) * total + parts["column"])
-        data = _sums(place, parts["block"], len(row))
+        data = sums_of(place, parts["block"], len(row))
         N = sp.bsr_matrix((data, columns, np.searchsorted(row, np.arange(G.rows + 1))), shape=(3 * G.rows, 3 * total))
     return square_block_matrix(comm, sp.bsr_matrix((N.data, columns, N.indptr), shape=(3 * G.rows, 3 * total)))
 
@@ -315,7 +344,7 @@ def _product(indptr, indices, blocks, x):
     return y
 
 
-def _sums(row: np.ndarray, blocks: Array, count: int) -> Array:
+def sums_of(row: np.ndarray, blocks: Array, count: int) -> Array:
     """Sums (count, ...) of the blocks (n, ...) of equal row. (numpy's add.at takes ten times as long.)"""
     add = sp.csr_matrix((np.ones(len(row)), (row, np.arange(len(row)))), shape=(count, len(row)))
     return (add @ blocks.reshape(len(row), int(np.prod(blocks.shape[1:])))).reshape(count, *blocks.shape[1:])

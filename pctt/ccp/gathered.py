@@ -10,9 +10,8 @@ import scipy.sparse as sp
 from mpi4py import MPI
 
 from dem.exchange import offsets
-from pctt.blocks import square_block_matrix
 from pctt.ccp.cone import Array
-from pctt.ccp.delassus import rows_in_blocks
+from pctt.ccp.delassus import GivenMatrix, rows_in_blocks
 from pctt.ccp.interior import conic
 from pctt.ccp.newton import Newton
 from pctt.ccp.newton.linear import Settings
@@ -24,7 +23,8 @@ from pctt.ccp.rolling import RollingProblem
 def takes(problem: ConeProblem, newton: Newton) -> bool:
     """Whether a problem has few contacts, on several ranks; the same on all."""
     few = newton.takes_few and problem.comm.size > 1 and problem.size <= Settings.few
-    return few and not isinstance(problem, RollingProblem) and not problem.by_rows().has_hubs
+    few = few and problem.has_entries and not isinstance(problem, RollingProblem)
+    return few and not problem.by_rows().has_hubs
 
 
 def solve(
@@ -38,16 +38,17 @@ def solve(
     found = Result(guess, Status.GIVEN_UP, "no order of elimination is cheap", np.inf, 0)
     if parts is not None:
         rows, r, mu, soft, start = zip(*parts)
-        N = square_block_matrix(MPI.COMM_SELF, sp.vstack(rows, format="bsr"))
+        N = GivenMatrix(MPI.COMM_SELF, sp.vstack([part.tocsr() for part in rows]).tobsr((3, 3)))
         given = np.concatenate(r), np.concatenate(mu)
         whole = ConeProblem(MPI.COMM_SELF, *given, N=N, compliance=np.concatenate(soft)[:, :2])
-        N.destroy()
         own = Newton(MPI.COMM_SELF, "body")
         if own.has_few(whole):
-            found = conic.solve(whole, np.concatenate(start), limits, options, own, coulomb=coulomb)
+            found = conic.solve(whole, np.concatenate(start), limits.unwatched, options, own, coulomb=coulomb)
         own.destroy()
         whole.destroy()
     found = comm.bcast(found)
+    for iteration, residual in enumerate(found.history):
+        limits.tell(iteration, residual)
     if found.status is Status.GIVEN_UP:
         found.impulse = guess
     else:

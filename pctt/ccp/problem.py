@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import copy
 from functools import cached_property
-from typing import NamedTuple, Union
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.compiled import loop
-from dem.contact_map import BlockRows, CompactRows, ContactMap
-from dem.exchange import reduced, refuse
+from dem.contact_map import BlockRows
+from dem.exchange import reduced
+from pctt.ccp import door
 from pctt.ccp.cone import Array, FrictionCones
-from pctt.ccp.delassus import BlockMap, GivenMatrix, delassus, without_hubs
-
-Given = Union[BlockRows, CompactRows, ContactMap]
+from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, without_hubs
 
 
 class Errors(NamedTuple):
@@ -39,14 +38,29 @@ class Errors(NamedTuple):
 class ConeProblem:
     """One step's cone problem, its contacts distributed over the ranks of ``comm``.
 
-    N = G G' + C is given by the mass-scaled contact map G = D' M^-1/2 (3Nc x 6M), or directly (``N``). The compliance
-    C is diagonal: contacts that yield a little, see `dem.stiffness`.
+    N = G M^-1 G' + C is given by the map G from velocities of unknowns to those of contacts, with the masses M of the
+    unknowns, or directly (``N``). The compliance C is diagonal: contacts that yield a little, see `dem.stiffness`.
+    Arrays and scipy matrices are the rows of this rank's contacts, with the columns of all.
+
+    r : (nc, 3) velocities of the contacts without impulses, plus gap/dt (m/s); (nc, 2) for contacts of the plane, whose
+        N and G have two rows for each, of the normal and of the tangent
+    mu : (nc,) friction coefficients, or (nc, 2), of each tangent, in elliptic cones |g_1 / mu_1, g_2 / mu_2| <= g_n
+    N : a numpy array, a scipy matrix, a PETSc Mat, or a `pctt.ccp.Operator`: products and diagonal blocks
+    G : a numpy array, a scipy matrix or a PETSc Mat (3 nc, n); `BlockRows`, `CompactRows` or a `ContactMap`, which are
+        scaled by M^-1/2
+    masses : of all n columns of G, whole on every rank: (n,) numbers, a matrix, a factor with ``solve(b)``, the pair of
+        `scipy.linalg.cho_factor`, a function b -> M^-1 b; a PETSc Vec, Mat or KSP. Without them M is the identity. If
+        they are no numbers N is made by one solve for each row
+
+    ValueError on all ranks for data of other shapes, or that are no numbers, for negative coefficients, and for
+    matrices that are not symmetric.
 
     Attributes
     ----------
-    r : (nc, 3) velocities of the contacts without impulses, plus gap/dt (m/s)
-    mu : (nc,) friction coefficients
-    operator : G or N, with its products; a copy of what was given, unless that is a `ContactMap`
+    r : (nc, 3) in the units of the cones, see ``units``
+    mu : (nc,) friction coefficients of circular cones
+    units : (nc, 3) the user's impulses over those in the cones; None where they are the same
+    operator : G or N, with its products; a copy of what was given, unless that is a `ContactMap` or an operator
     contact_map : the operator if it is G, and the bodies are known; or None
     point : (nc, 3) contact points (m) or None; orders the unknowns of hierarchical preconditioners
     key : (nc,) persistent names of the contacts or None
@@ -55,6 +69,7 @@ class ConeProblem:
     yields : whether C is not zero, the same on all ranks
     cones : those of the contacts of this rank
     size : contacts on all ranks, Nc
+    unanswered : contacts on all ranks that no impulse moves: N has zeros in their rows
     mean_diagonal : mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts
     """
 
@@ -64,8 +79,9 @@ class ConeProblem:
         r: Array,
         mu: Array,
         *,
-        G: Given | None = None,
-        N: PETSc.Mat | None = None,
+        G: door.Given | None = None,
+        N: door.Matrix | GivenOperator | None = None,
+        masses: Any = None,
         point: Array | None = None,
         key: np.ndarray | None = None,
         compliance: Array | float = 0.0,
@@ -73,26 +89,27 @@ class ConeProblem:
         if (G is None) == (N is None):
             raise ValueError("a cone problem is given by either the map G or the matrix N")
         self.comm, self.point, self.key = comm, point, key
-        refuse(comm, _wrong(r, mu, G, N, point, key, compliance))
-        self.r = np.ascontiguousarray(r, dtype=float).reshape(-1, 3)
-        self.mu = np.ascontiguousarray(mu, dtype=float)
+        rest = {"G": G, "masses": masses, "point": point, "key": key, "compliance": compliance}
+        contacts = door.contacts_of(comm, r, mu, **rest)
+        self.units, self._width = contacts.units, contacts.width
+        self.r, self.mu, self._given_r = contacts.r, contacts.mu, contacts.given_r
         self.compliance = compliances(compliance, len(self.r))
         self.cones = self._cones()
-        self.contact_map = None if G is None else _map(comm, G)
-        self.operator: ContactMap | GivenMatrix = self.contact_map or GivenMatrix(comm, N)
-        bad = _not_finite(self.r)
-        if not _none_negative(self.mu):
-            bad += int(np.sum(~((self.mu >= 0) & (self.mu < np.inf))))
+        self.operator = self._given_operator = door.operator_of(comm, len(self.mu), contacts.width, N, G, masses)
+        if self.units is not None:
+            self.operator = door.in_units(comm, self._given_operator, self.units)
+        self.contact_map = None if isinstance(self.operator, GivenOperator) else self.operator
         trace = _diagonals(self._rigid_blocks).sum()  # has squares of all numbers of G
         known = self.contact_map is not None and np.isfinite(trace)
         wrong = 0 if known else _not_finite(self._rigid_blocks)
-        here = np.array([bad, wrong, self.cones.count, self.compliance.max(initial=0.0) > 0.0, self.r.size, trace])
+        unanswered = np.count_nonzero(~(_diagonals(self._rigid_blocks) + self.compliance).any(axis=1))
+        soft = self.compliance.max(initial=0.0) > 0.0
+        here = np.array([wrong, self.cones.count, soft, self.r.size, unanswered, trace])
         *counts, trace = self.sum(here).tolist()
-        bad, wrong, self.size, soft, rows = map(int, counts)
-        if bad or wrong:
+        wrong, self.size, soft, rows, self.unanswered = map(int, counts)
+        if wrong:
             self.destroy()
-            what = f"{bad} contacts with a" if bad else f"G has a NaN or an infinite number in {wrong} contacts"
-            raise ValueError(f"{what} NaN, infinite or negative coefficient" if bad else what)
+            raise ValueError(f"G has a NaN or an infinite number in {wrong} contacts")
         self.yields = bool(soft)
         self.mean_diagonal = trace / rows if trace > 0.0 else 1.0
 
@@ -102,6 +119,28 @@ class ConeProblem:
 
     def _cones(self) -> FrictionCones:
         return FrictionCones(self.mu)
+
+    # -- the user's units ------------------------------------------------------------------------------------
+
+    def shown(self, g: Array) -> Array:
+        """The user's impulses (nc, 3), or (nc, 2) in the plane, of impulses g (nc, 3) in the cones."""
+        return g if self.units is None else (self.units * g)[:, : self._width]
+
+    def in_cones(self, impulse: Array) -> Array:
+        """Impulses (nc, 3) in the cones from the user's."""
+        if self.units is None:
+            return impulse
+        g = np.zeros_like(self.r)
+        given = self.units[:, : self._width]
+        np.divide(impulse, given, out=g[:, : self._width], where=given > 0.0)
+        return g
+
+    def velocities_by(self, g: Array) -> Array:
+        """The user's velocities y = N g + r (nc, 3), or (nc, 2) in the plane, by impulses g (nc, 3) in the cones."""
+        g = g if self.units is None else self.units * g
+        y = self._given_r + self.compliance * g
+        self._given_operator.add_delassus(g, y)
+        return y[:, : self._width]
 
     # -- the operator ---------------------------------------------------------------------------------------
 
@@ -149,10 +188,17 @@ class ConeProblem:
         return N
 
     def rigid_matrix(self) -> PETSc.Mat:
-        """A new Mat like ``N`` without the compliance."""
+        """A new Mat like ``N`` without the compliance. ValueError if the problem is given by products."""
         if isinstance(self.operator, GivenMatrix):
             return self.operator.mat.duplicate(copy=True)
+        if not self.has_entries:
+            raise ValueError("N is given by its products, and has no entries; allowed is N as a matrix")
         return delassus(self.comm, self._split[0])
+
+    @property
+    def has_entries(self) -> bool:
+        """Whether those of N are known, and not its products alone."""
+        return self.contact_map is not None or isinstance(self.operator, GivenMatrix)
 
     @property
     def has_hubs(self) -> bool:
@@ -257,7 +303,8 @@ class ConeProblem:
 
     def destroy(self) -> None:
         """Free the PETSc objects now."""
-        self.operator.destroy()
+        for operator in {id(each): each for each in (self.operator, self._given_operator)}.values():
+            operator.destroy()
         if "N" in self.__dict__:
             self.__dict__.pop("N").destroy()
 
@@ -290,47 +337,3 @@ def _not_finite(array: Array) -> int:
     if np.isfinite(array.sum()):  # so are all its numbers
         return 0
     return int((~np.isfinite(array).reshape(len(array), -1).all(axis=1)).sum())
-
-
-def _none_negative(array: Array) -> bool:
-    """Whether all numbers are finite and >= 0."""
-    return bool(array.min(initial=0.0) >= 0.0 and array.max(initial=0.0) < np.inf)
-
-
-def _map(comm: MPI.Comm, G: Given) -> ContactMap:
-    """The map in any of its forms, with the products of frames and arms counted by PETSc's log."""
-    if isinstance(G, BlockRows):
-        return BlockMap(comm, G)
-    contact_map = G if isinstance(G, ContactMap) else ContactMap(comm, G)
-    contact_map.log_flops = PETSc.Log.logFlops
-    return contact_map
-
-
-def _wrong(
-    r: Array, mu: Array, G: Given | None, N: PETSc.Mat | None, point: Array | None, key: np.ndarray | None,
-    compliance: Array | float,
-) -> str:  # fmt: skip
-    """What is wrong with the shapes of a problem's data on this rank; empty if nothing is."""
-    try:
-        shape, friction = np.asarray(r, dtype=float).shape, np.asarray(mu, dtype=float).shape
-    except (TypeError, ValueError) as error:
-        return f"r or mu are no numbers: {error}"
-    nc = int(np.prod(shape)) // 3
-    if shape not in ((nc, 3), (3 * nc,)):
-        return f"r has the shape {shape}; allowed is (nc, 3)"
-    if friction != (nc,):
-        return f"{nc} contacts in r but {friction[0] if len(friction) == 1 else friction} friction coefficients"
-    known = isinstance(G, (BlockRows, CompactRows, ContactMap))
-    if G is not None and (not known or G.rows != nc):
-        rows = f"{G.rows} contacts" if known else f"the type {type(G).__name__}"
-        return f"{nc} contacts in r, but G has {rows}; allowed are BlockRows or CompactRows of as many"
-    if N is not None and N.getLocalSize() != (3 * nc, 3 * nc):
-        return f"{nc} contacts in r, but N has {N.getLocalSize()} local rows and columns"
-    for name, given, width in (("point", point, (3,)), ("key", key, ())):
-        if given is not None and np.shape(given) != (nc, *width):
-            return f"{name} has the shape {np.shape(given)}; allowed is {(nc, *width)}"
-    if np.shape(compliance) not in ((), (nc,), (nc, 2)):
-        return f"compliance has the shape {np.shape(compliance)}; allowed are {(nc,)}, {(nc, 2)}, or a number"
-    if not _none_negative(np.asarray(compliance)):
-        return "compliance: allowed are numbers >= 0"
-    return ""

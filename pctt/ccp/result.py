@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, Optional
 
 import numpy as np
 
@@ -47,6 +48,8 @@ class Limits:
     )
     spare: int = number(0, "the iterations for it; the conic method, which takes a few, needs none")
     fallback: bool = option(True, "where the solver does not converge, another one goes on from its impulses")
+    monitor: bool = option(False, "print the iterations and the residual wherever a solver looks at it")
+    watch: Optional[Callable[[int, float], None]] = number(None, "it is told both, too, on every rank")
 
     def residual(self, errors: Errors) -> float:
         """What ``tol`` is for: the natural residual, or the closing or opening work, or the closing speed, each in
@@ -67,6 +70,23 @@ class Limits:
         if work <= self.closing_work:
             above = f"closing speed {speed:.2g} m/s, above {self.closing_speed:g}"
         return f"squeezed: {above}, at a natural residual of {natural:.1e}, {ENOUGH:g} times below the tolerance"
+
+    def tell(self, iterations: int, residual: float) -> None:
+        """Tell who watches."""
+        if self.watch is not None:
+            self.watch(iterations, residual)
+
+    def after(self, iterations: int) -> Limits:
+        """For a method that goes on after so many iterations of others."""
+        watch = self.watch
+        if watch is None:
+            return self
+        return dataclasses.replace(self, watch=lambda more, residual: watch(iterations + more, residual))
+
+    @property
+    def unwatched(self) -> Limits:
+        """For a method whose residual is not that of the problem."""
+        return dataclasses.replace(self, watch=None)
 
     @property
     def aimed(self) -> float:
@@ -98,13 +118,22 @@ class Status(Enum):
     GIVEN_UP = "given up"  #: the method does not apply
 
 
+class Counts(NamedTuple):
+    """Contacts of all ranks by what they do."""
+
+    open: int
+    sliding: int
+    sticking: int
+
+
 @dataclass
 class Result:
     """Impulses of a cone problem and how they were found.
 
     Attributes
     ----------
-    impulse : (nc, 3) impulses of this rank's contacts (N s)
+    impulse : (nc, 3) impulses of this rank's contacts (N s); (nc, 2) in the plane
+    velocity : the velocities y = N g + r of that shape (m/s); set by `pctt.ccp.solve`
     status : CONVERGED where the residual and the closing work of `Limits` are below theirs, else why not. SQUEEZED:
         bodies are pressed so hard, or have masses so far apart, that the closing work says nothing, or that forces on
         light bodies are wrong. No other method would do better
@@ -119,7 +148,8 @@ class Result:
     newton_its : the Newton steps among the iterations
     law : RELAXATION, COULOMB or FIXED_POINT: the law of the impulses and of the residuals
     accuracy : the figures of the impulses; set by `pctt.ccp.solve`
-    momentum : (6m,) G' g, or g where the problem is given by N; set by `pctt.ccp.solve`
+    momentum : (6m,) G' g, or g where the problem is given by N, in the units of the cones; set by `pctt.ccp.solve`
+    counts : the open, sliding and sticking contacts of all ranks; set by `pctt.ccp.solve`
     beyond : iterations among them after the limits were met, towards the aim beyond these
     asked : what the asked method made of it, where another one had to follow; else None
     exhausted : whether it has tried the other methods, too
@@ -139,9 +169,30 @@ class Result:
     law: str = RELAXATION
     accuracy: Accuracy | None = None
     momentum: Array = field(default_factory=lambda: np.zeros(0))
+    velocity: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    counts: Counts = Counts(0, 0, 0)
     beyond: int = 0
     asked: Result | None = None
     exhausted: bool = False
+
+    def __str__(self) -> str:
+        """A table of how it was found; the impulses are not in it."""
+        law = "Coulomb's law" if self.law != RELAXATION else "relaxation of Coulomb's law"
+        work = f"{self.newton_its} Newton steps, {self.ksp_its} Krylov iterations" if self.newton_its else ""
+        rows = {
+            "status": f"{self.status.value} ({self.reason})",
+            "solver": f"{self.solver}, {law}",
+            "iterations": f"{self.iterations}" + f" ({work})" * bool(work),
+            "residual": f"{self.residual:.2e}",
+        }
+        if (found := self.accuracy) is not None:
+            natural = found.natural_residual if self.law == RELAXATION else found.coulomb_residual
+            name = "natural" if self.law == RELAXATION else "Coulomb"
+            works = f"closing work {found.closing_work:.1e}, opening work {found.opening_work:.1e}"
+            rows["residual"] += f" ({name} {natural:.1e}, {works})"
+            parts = ", ".join(f"{count} {name}" for name, count in self.counts._asdict().items())
+            rows["contacts"] = f"{sum(self.counts)} ({parts})"
+        return "\n".join(f"{name:10}  {value}" for name, value in rows.items())
 
     @property
     def converged(self) -> bool:

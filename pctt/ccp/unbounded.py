@@ -14,7 +14,8 @@ from dem.compiled import loop
 from dem.contact_map import find_halo
 from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
-from pctt.ccp.cone import Array
+from pctt.ccp.cone import TINY, Array, tangential
+from pctt.ccp.delassus import ColumnMap, sums_of
 from pctt.ccp.problem import ConeProblem
 
 
@@ -27,7 +28,7 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
     as unbounded if the bound is more than a thousand times ||r|| / sqrt(d' diag(N) d), the size that the data
     suggest; a contact counts in ||r|| by its share in d, and in diag(N) by the mean of its block, as what no impulse
     moves along the normal may move along the tangents. Self-stress, G'd = 0 with r.d >= 0, does not count, however
-    large. If all contacts yield no problem is unbounded.
+    large. If all contacts yield no problem is unbounded. If d'Nd < 0 every problem is.
 
     A heavy body, too, has a small part in G'd: a press on a light grain. So where G is known, the impulses of d must
     cancel on every body in units of its own mass, see `_left_over`. What joints bear cancels too.
@@ -41,25 +42,48 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
     bound = (along / (1e3 * size * speed)) ** 2 if along < 0 < size * speed else 0.0
     if not bound > max(yielding / alone if alone > 0 else 0.0, 1e-15):  # a part of d'Nd, and its rounding
         return ""
-    if alone > 0 and not bound > problem.dot(problem.product(g) if y is None else y - problem.r, g) / alone:
+    energy = problem.dot(problem.product(g) if y is None else y - problem.r, g) if alone > 0 else 0.0
+    if alone > 0 and not bound > energy / alone:
         return ""
     if problem.contact_map is not None and not bound > _left_over(problem, g / size):
         return ""
+    if energy < -1e-12 * alone:
+        return f"unbounded: N is indefinite, d'Nd = {energy / length:.1e} for a direction d of impulses"
     return f"unbounded: impulses grow without limit (norm {size:.1e} N s, {-along / size:.1e} J for each N s more)"
+
+
+def why_unanswered(problem: ConeProblem, coulomb: bool) -> str:
+    """The reason, in words, if contacts that no impulse moves close, so that the problem is unbounded, or none obeys
+    Coulomb's law; else "". For these contacts the test N d = 0, r.d < 0 with d in the cones is exact. Collective."""
+    if not problem.unanswered or len(problem.r) != problem.cones.count:
+        return ""
+    slip = tangential(problem.r)
+    falls = problem.r[:, 0] - (0.0 if coulomb else problem.mu * slip)
+    rays = ~problem.diagonal.any(axis=1) & (falls < -1e-12 * (np.abs(problem.r[:, 0]) + problem.mu * slip))
+    d = np.zeros_like(problem.r)
+    d[rays, 0] = 1.0
+    if not coulomb:
+        d[rays, 1:] = -(problem.mu / np.maximum(slip, TINY))[rays, None] * problem.r[rays, 1:]
+    count, close = problem.sum(int(rays.sum())), "close" if coulomb else "close or slide"
+    if count and problem.norm(problem.product(d)) <= 1e-14 * problem.mean_diagonal * problem.norm(d):
+        return f"unbounded: no impulse moves {count} contacts, which {close}"
+    return ""
 
 
 def _left_over(problem: ConeProblem, d: Array) -> float:
     """How much impulses d (nc, 3) leave on the bodies: the sum of |G_b' d|^2 / |G_b|^2 over the bodies b, with G_b the
-    columns of a body, of which the mass drops out; between 0 and 2 for ||d|| = 1. Collective."""
+    columns of a body, of which the mass drops out; between 0 and 2 for ||d|| = 1. Of a matrix a column is a body.
+    Collective."""
     assert problem.contact_map is not None
     known = problem.contact_map
     G = (known.free if isinstance(known, (CellMap, JointedMap)) else known).block_rows
     halo, body = find_halo(problem.comm, G.columns, G.indices)
-    each = np.bincount(body, (G.blocks**2).sum(axis=(1, 2)), halo.rows)
+    each = sums_of(body, (G.blocks**2).sum(axis=1), halo.rows)
     halo.add(each)
-    size = each[: G.columns]
-    momentum = np.square(problem.momentum(d).reshape(-1, 6)[: G.columns]).sum(axis=1)
-    return float(problem.sum(np.divide(momentum, size, out=np.zeros(len(size)), where=size > 0).sum()))
+    size, momentum = each[: G.columns], np.square(problem.momentum(d).reshape(-1, 6)[: G.columns])
+    if not isinstance(known, ColumnMap):
+        size, momentum = size.sum(axis=1), momentum.sum(axis=1)
+    return float(problem.sum(np.divide(momentum, size, out=np.zeros(size.shape), where=size > 0).sum()))
 
 
 @loop

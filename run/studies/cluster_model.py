@@ -222,10 +222,13 @@ def conic(n: int) -> list[Row]:
 def solved(problem: ccp.ConeProblem, solver: str, tol: float) -> Row:
     """Counts and CPU seconds of a cold start."""
     newton = ccp.newton_for(problem.comm, solver) if ccp.SOLVERS[solver].newton else None
-    ccp.solve(problem, None, solver, ccp.Limits(0.1), newton=newton)  # loads compiled loops
+    ccp.solve(problem, None, solver, ccp.Limits(0.1), newton=newton, law=ccp.RELAXATION)  # loads compiled loops
     before, start = PETSc.Log.Event("CCPSolve").getPerfInfo()["numReductions"], time.process_time()
     with Spent(Halo, "_wait") as halos, Spent(ccp.ConeProblem, "_reduced") as own, Factors() as factors:
-        result = ccp.solve(problem, None, solver, ccp.Limits(tol, closing_work=np.inf, fallback=False), newton=newton)
+        result = ccp.solve(
+            problem, None, solver, ccp.Limits(tol, closing_work=np.inf, fallback=False), newton=newton,
+            law=ccp.RELAXATION,
+        )
     seconds = time.process_time() - start
     of_petsc = PETSc.Log.Event("CCPSolve").getPerfInfo()["numReductions"] - before
     if newton is not None:

@@ -209,7 +209,7 @@ def pdip(given: Namespace, about: Row) -> None:
                 newton = ccp.newton_for(MPI.COMM_SELF, "pdip")
                 start = time.process_time()
                 limits = ccp.Limits(1e-4, -1, np.inf, fallback=False)
-                result = ccp.solve(problem, None, "pdip", limits, None, newton=newton)
+                result = ccp.solve(problem, None, "pdip", limits, None, newton=newton, law=ccp.RELAXATION)
                 spent[way].append(time.process_time() - start)
                 newton.destroy()
                 for name in WAYS[way]:

@@ -69,7 +69,7 @@ def replays(n: int, steps: int = 1, max_it: int = -1, form: str = "program") -> 
         newton = Recorder(COMM)
         with next_problem(sim) as problem:
             limits = ccp.Limits(TOL, max_it, np.inf, fallback=False)
-            ccp.solve(problem, None, "pdip", limits, FORMS[form], newton=newton)
+            ccp.solve(problem, None, "pdip", limits, FORMS[form], newton=newton, law=ccp.RELAXATION)
             replay = Replay(problem, newton.systems)
             yield replay
             replay.destroy()

@@ -46,7 +46,9 @@ def test_every_preconditioner_solves_every_system():
     names = ["none", "jacobi", "pbjacobi", "ilu", "ilu-shifted", "icc-shifted", "sor", "cholesky"]
     comparison = Comparison(SELF, names)
     known, graph = heap()
-    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-5), newton=by(comparison))
+    result = ccp.solve(
+        from_graph(known, graph), limits=Limits(1e-5), newton=by(comparison), type="pdip", law=ccp.RELAXATION
+    )
     assert result.converged
     summary = comparison.summary()
     assert list(summary) == names
@@ -126,7 +128,9 @@ def test_where_none_converged_the_best_is_used_and_the_step_is_saved(database):
     assert done.true_residual == best == pytest.approx(np.linalg.norm(dense @ x.array - b.array) / b.norm())
     known, graph = heap()
     comparison = Comparison(SELF, ["none"])
-    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-5), newton=by(comparison))
+    result = ccp.solve(
+        from_graph(known, graph), limits=Limits(1e-5), newton=by(comparison), type="pdip", law=ccp.RELAXATION
+    )
     assert result.converged
     assert 0 < result.fallbacks <= comparison.summary()["none"]["systems"]
     figures = ccp.measure(from_graph(known, graph), result.impulse)
@@ -140,7 +144,9 @@ def test_the_seconds_of_all_but_the_chosen_are_apart():
     log.take_seconds(("solve", "compare"))
     start = time.perf_counter()
     with log.phase("solve"):
-        result = ccp.solve(from_graph(known, graph), limits=Limits(1e-5), newton=by(comparison))
+        result = ccp.solve(
+            from_graph(known, graph), limits=Limits(1e-5), newton=by(comparison), type="pdip", law=ccp.RELAXATION
+        )
     whole = time.perf_counter() - start
     assert result.converged
     own, *others = (sum(s.setup_s + s.solve_s for s in solves) for solves in comparison.solves.values())
@@ -156,7 +162,9 @@ def test_the_count_goes_on_over_several_problems():
         known, graph = heap(contacts, contacts)
         problem = from_graph(known, graph)
         for comparison in (every, second):
-            assert ccp.solve(problem, limits=Limits(1e-4), newton=by(comparison)).converged
+            assert ccp.solve(
+                problem, limits=Limits(1e-4), newton=by(comparison), type="pdip", law=ccp.RELAXATION
+            ).converged
         problem.destroy()
     systems = every.summary()["icc"]["systems"]
     assert second.summary()["icc"]["systems"] == -(-systems // 2)
@@ -230,7 +238,9 @@ def test_on_two_ranks_factorisations_work_within_each_rank_and_say_so(database):
     comparison = Comparison(comm, ["ilu", "ilu-shifted", "icc", "own:sor", "pbjacobi", "python"])
     known, graph = heap(bodies=30)
     newton = ccp.newton_for(comm, "pdip", compare=comparison)
-    result = ccp.solve(from_graph(known, graph, comm), limits=Limits(1e-5), newton=newton)
+    result = ccp.solve(
+        from_graph(known, graph, comm), limits=Limits(1e-5), newton=newton, type="pdip", law=ccp.RELAXATION
+    )
     with pytest.raises(OptionError):
         Comparison(comm, ["nonsense"])
     assert result.converged

@@ -65,7 +65,7 @@ def packing(side: int = 5, seed: int = 0) -> tuple[BlockRows, np.ndarray, np.nda
 
 def solve(problem: ConeProblem, tol: float, form: str = "auto") -> ccp.Result:
     newton = newton_for(problem.comm, "conic", form)
-    result = ccp.solve(problem, None, "conic", Limits(tol), newton=newton)
+    result = ccp.solve(problem, None, "conic", Limits(tol), newton=newton, law=ccp.RELAXATION)
     newton.destroy()
     return result
 
@@ -107,7 +107,9 @@ def test_its_systems_change_from_block_jacobi_to_factors_if_the_memory_has_room(
         monkeypatch.setattr(memory, "available", lambda comm: 1e5)
     G, r, mu = packing(8 if room else 5)
     newton = newton_for(SELF, "conic")
-    assert ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", Limits(1e-6), newton=newton).converged
+    assert ccp.solve(
+        ConeProblem(SELF, r, mu, G=G), None, "conic", Limits(1e-6), newton=newton, law=ccp.RELAXATION
+    ).converged
     assert newton.linear.fallbacks == 0
     jacobi, factor = ("cg", "pbjacobi"), ("cg", "python")
     assert list(dict.fromkeys(used)) == ([jacobi, factor] if room else [jacobi])  # in the order of their first use
@@ -152,7 +154,9 @@ def test_methods_agree_on_the_compliant_optimum(compliance, along):
     soft = np.tile([compliance, along * compliance], (len(known.mu), 1))
     problem = ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=soft)
     tol = 1e-3 * compliance
-    found = {name: ccp.solve(problem, type=name, limits=Limits(tol)) for name in ("conic", "pdip", "apgd")}
+    found = {name: ccp.solve(
+        problem, type=name, limits=Limits(tol), law=ccp.RELAXATION
+    ) for name in ("conic", "pdip", "apgd")}
     for result in found.values():
         check(problem, result, tol)
         normal, best = result.impulse[:, 0], found["conic"].impulse[:, 0]
@@ -164,6 +168,6 @@ def test_a_rounded_singular_matrix_keeps_none_from_the_tolerance():
     N = random_graph(0, 200, 60).dense()
     rounded = np.vectorize(lambda value: float(f"{value:.5g}"))(N @ N.T)
     known = known_optimum(0, 0.5 * (rounded + rounded.T), np.ones(200))
-    found = ccp.solve(from_matrix(known), None, "conic", Limits(1e-8))
+    found = ccp.solve(from_matrix(known), None, "conic", Limits(1e-8), law=ccp.RELAXATION)
     assert found.converged
     assert found.fallbacks == 0

@@ -86,7 +86,7 @@ def test_a_local_problem_is_read(tmp_path, kind):
     assert np.allclose(dense(problem), known.N, atol=1e-13 * np.abs(known.N).max())
     assert np.array_equal(problem.r, known.r)
     assert np.array_equal(problem.mu, known.mu)
-    result = ccp.solve(problem, limits=Limits(1e-6))
+    result = ccp.solve(problem, limits=Limits(1e-6), type="pdip", law=ccp.RELAXATION)
     assert result.converged
     assert ccp.measure(problem, result.impulse).objective == pytest.approx(known.objective, rel=1e-5)
 
@@ -136,7 +136,7 @@ def test_a_problem_in_the_plane_is_solved_in_space(tmp_path, form):
     np.testing.assert_array_equal(stored.solution, np.hstack([g, np.zeros((9, 1))]))
     assert ccp.measure(stored.problem, stored.solution).natural_residual < 1e-14
     for solver in ("pdip", "conic", "apgd"):
-        result = ccp.solve(stored.problem, type=solver, limits=Limits(1e-8))
+        result = ccp.solve(stored.problem, type=solver, limits=Limits(1e-8), law=ccp.RELAXATION)
         assert result.converged, solver
         np.testing.assert_allclose(result.impulse[:, :2], g, atol=1e-5)
 
@@ -253,7 +253,7 @@ def test_the_problem_of_lmgc_whose_mass_matrix_is_one_triangle():
         pytest.skip(f"{path} is not here; PCTT_FCLIB names the folder beside it")
     stored = fclib.load(path, SELF)
     assert "one triangle" in stored.note
-    result = ccp.solve(stored.problem, limits=Limits(1e-8))
+    result = ccp.solve(stored.problem, limits=Limits(1e-8), type="pdip", law=ccp.RELAXATION)
     assert result.converged
     assert ccp.measure(stored.problem, result.impulse).objective == pytest.approx(-0.44168753, abs=1e-8)
 
@@ -520,7 +520,7 @@ def test_a_crowded_body_is_refused_where_it_would_fill_the_matrix(tmp_path, crow
 
 def test_gauss_seidel_refuses_a_crowded_body(crowded):
     with pytest.raises(OptionError, match="-ccp_type gauss_seidel: a body has"):
-        ccp.solve(crowded[0], type="gauss_seidel")
+        ccp.solve(crowded[0], type="gauss_seidel", law=ccp.RELAXATION)
 
 
 # -- several ranks ---------------------------------------------------------------------------------------
@@ -562,7 +562,7 @@ def test_published_problems(name, contacts, objective, velocity_norm, solver):
     if not path.exists():
         pytest.skip(f"{path} is not here; PCTT_FCLIB names the folder of the FCLIB files")
     problem = fclib.read(path, SELF)
-    result = ccp.solve(problem, type=solver, limits=Limits(1e-7))
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-7), law=ccp.RELAXATION)
     assert result.converged
     figures = ccp.measure(problem, result.impulse)
     assert problem.size == contacts

@@ -161,7 +161,9 @@ def test_every_iteration_descends(method, monkeypatch):
         return goes_on(self, x, gradient)
 
     monkeypatch.setattr(Progress, "goes_on", watched)
-    ccp.solve(problem, project(100 * np.abs(known.r), known.mu), method, Limits(1e-12, 40, fallback=False))
+    ccp.solve(
+        problem, project(100 * np.abs(known.r), known.mu), method, Limits(1e-12, 40, fallback=False), law=ccp.RELAXATION
+    )
     assert len(values) == 41
     assert np.all(np.diff(values) < 0)
 
@@ -174,7 +176,7 @@ def test_an_accuracy_that_cannot_be_reached_ends_with_a_reason(method):
     known, graph = heap(bodies=60, contacts=10)
     problem = from_graph(known, graph)
     options = ccp.SOLVERS[method].options(patience=150)
-    result = ccp.solve(problem, None, method, Limits(1e-30, fallback=False), options)
+    result = ccp.solve(problem, None, method, Limits(1e-30, fallback=False), options, law=ccp.RELAXATION)
     if not result.converged:  # a residual of exactly zero is no stagnation
         assert "no progress" in result.reason
     assert result.iterations < ccp.SOLVERS[method].iterations
@@ -188,7 +190,7 @@ def test_a_matrix_with_a_nan_does_not_converge(method):
     known, _ = heap(contacts=6, bodies=4)
     problem = from_matrix(known)
     problem.operator.local.data[1, 0, 2] = np.nan  # a problem with a NaN is refused; this one gets it afterwards
-    result = ccp.solve(problem, type=method, limits=Limits(1e-6))
+    result = ccp.solve(problem, type=method, limits=Limits(1e-6), law=ccp.RELAXATION)
     assert not result.converged
     assert "not a number" in result.reason
     assert result.iterations <= 30
@@ -207,7 +209,7 @@ def test_apgd_begins_in_single_precision_and_ends_in_double(size, monkeypatch):
         return descend(progress, *arguments)
 
     monkeypatch.setattr(apgd, "_descend", watched)
-    result = ccp.solve(problem, type="apgd", limits=Limits(1e-12))
+    result = ccp.solve(problem, type="apgd", limits=Limits(1e-12), law=ccp.RELAXATION)
     assert stages == [np.float32, np.float64]
     assert result.converged
     assert result.impulse.dtype == np.float64
@@ -239,11 +241,11 @@ def test_iterates_do_not_depend_on_the_ranks(method, double):
     comm, limits = MPI.COMM_WORLD, Limits(1e-13, 15, fallback=False)
     alone = problems_of(SELF)
     for name, problem in problems_of(comm).items():
-        result = ccp.solve(problem, type=method, limits=limits)
+        result = ccp.solve(problem, type=method, limits=limits, law=ccp.RELAXATION)
         said = (result.converged, result.reason, result.iterations, result.history)
         assert comm.allgather(said) == [said] * comm.size
         impulse = np.concatenate(comm.allgather(result.impulse))
-        expected = ccp.solve(alone["few" if name == "few" else "even"], type=method, limits=limits)
+        expected = ccp.solve(alone["few" if name == "few" else "even"], type=method, limits=limits, law=ccp.RELAXATION)
         assert abs(result.iterations - expected.iterations) <= (name == "few")
         assert np.allclose(impulse, expected.impulse, rtol=0, atol=1e-9)
         problem.destroy()

@@ -70,7 +70,7 @@ def test_every_form_gives_the_optimum(form, solver):
     known, graph = heap(3)
     problem = from_graph(known, graph)
     newton = ccp.newton_for(SELF, solver, form)
-    result = ccp.solve(problem, type=solver, limits=ccp.Limits(1e-6), newton=newton)
+    result = ccp.solve(problem, type=solver, limits=ccp.Limits(1e-6), newton=newton, law=ccp.RELAXATION)
     assert result.converged, result.reason
     assert np.linalg.norm(problem.product(result.impulse) + problem.r - known.y) < 1e-3 * np.linalg.norm(known.y)
     newton.destroy()
@@ -92,8 +92,8 @@ def test_a_matrix_with_entries_in_other_places_is_another_one(form):
             dense[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = block.T
         N = matrix(comm, dense)
         with ccp.ConeProblem(comm, r[here], mu[here], N=N) as problem:
-            result = ccp.solve(problem, type="pdip", limits=ccp.Limits(1e-8), newton=newton)
-            alone = ccp.solve(problem, type="pdip", limits=ccp.Limits(1e-8))
+            result = ccp.solve(problem, type="pdip", limits=ccp.Limits(1e-8), newton=newton, law=ccp.RELAXATION)
+            alone = ccp.solve(problem, type="pdip", limits=ccp.Limits(1e-8), law=ccp.RELAXATION)
             assert result.converged
             assert result.fallbacks == alone.fallbacks == 0
             assert np.allclose(result.impulse, alone.impulse, atol=1e-7)
@@ -211,7 +211,7 @@ def test_methods_without_multipliers_refuse_them_as_unknowns():
             ccp.newton_for(SELF, solver, "kkt")
         newton = ccp.Newton(SELF, "kkt")
         with pytest.raises(ValueError, match="the Newton form 'kkt'"):
-            ccp.solve(from_matrix(heap()[0]), type=solver, newton=newton)
+            ccp.solve(from_matrix(heap()[0]), type=solver, newton=newton, law=ccp.RELAXATION)
         newton.destroy()
 
 

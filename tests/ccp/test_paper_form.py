@@ -15,6 +15,7 @@ from pctt.ccp.interior.pdip import PDIP
 from pctt.ccp.newton.kkt import KKT
 
 PAPER = PDIP(form="paper")
+BY_PDIP = {"type": "pdip", "law": ccp.RELAXATION}
 
 
 @pytest.fixture
@@ -89,7 +90,7 @@ def test_reaches_the_known_optimum(name, form):
     known, graph = heap(**PROBLEMS[name])
     for problem in (from_graph(known, graph, comm), from_matrix(known, comm)):
         newton = ccp.newton_for(comm, "pdip", form)
-        result = ccp.solve(problem, limits=Limits(1e-6, fallback=False), options=PAPER, newton=newton)
+        result = ccp.solve(problem, limits=Limits(1e-6, fallback=False), options=PAPER, newton=newton, **BY_PDIP)
         assert result.converged, result.reason
         assert result.accuracy.natural_residual <= 1.01e-6
         assert result.accuracy.cone_violation <= 1e-12 * result.accuracy.impulse_norm
@@ -105,8 +106,8 @@ def test_finds_the_impulses_of_the_other_methods(other):
     """Where N is regular they are unique."""
     known, graph = heap(4, bodies=60, mu=np.arange(40) % 4 * 0.2)
     problem = from_graph(known, graph)
-    ours = ccp.solve(problem, limits=Limits(1e-7, fallback=False), options=PAPER)
-    theirs = ccp.solve(problem, type=other, limits=Limits(1e-9))
+    ours = ccp.solve(problem, limits=Limits(1e-7, fallback=False), options=PAPER, **BY_PDIP)
+    theirs = ccp.solve(problem, type=other, limits=Limits(1e-9), law=ccp.RELAXATION)
     assert ours.converged
     assert theirs.converged
     assert np.linalg.norm(ours.impulse - theirs.impulse) < 1e-4 * np.linalg.norm(theirs.impulse)
@@ -114,7 +115,7 @@ def test_finds_the_impulses_of_the_other_methods(other):
 
 def test_two_positive_multipliers_per_contact_carry_the_velocities(steps):
     known, graph = heap(bodies=30, mu=np.arange(40) % 4 * 0.3)
-    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-6, fallback=False), options=PAPER)
+    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-6, fallback=False), options=PAPER, **BY_PDIP)
     assert result.iterations == len(steps) > 10
     for kkt in steps:
         assert kkt.lam.shape == kkt.f.shape == (40, 2)
@@ -133,7 +134,7 @@ def test_begins_with_the_last_impulses_or_one_and_multipliers_on_the_central_pat
     guess = np.zeros((40, 3))
     guess[::3] = [2.5, 0.1, -0.2]
     guess[1] = [-1.0, 0.0, 0.0]
-    ccp.solve(from_graph(known, graph), guess, limits=Limits(1e-6, 1, fallback=False), options=PAPER)
+    ccp.solve(from_graph(known, graph), guess, limits=Limits(1e-6, 1, fallback=False), options=PAPER, **BY_PDIP)
     normal = np.where(np.arange(40) % 3 == 0, 2.5, 1.0)
     f = np.column_stack([-0.5 * (known.mu * normal) ** 2, -normal])
     np.testing.assert_allclose(steps[0].f, f, rtol=1e-14)
@@ -145,7 +146,7 @@ def test_begins_with_the_last_impulses_or_one_and_multipliers_on_the_central_pat
 def test_its_two_numbers_are_options_and_have_their_own_defaults():
     known, graph = heap(bodies=30)
     counts = [
-        ccp.solve(from_graph(known, graph), limits=Limits(1e-5, fallback=False), options=options).iterations
+        ccp.solve(from_graph(known, graph), limits=Limits(1e-5, fallback=False), options=options, **BY_PDIP).iterations
         for options in (
             PAPER,
             PDIP(form="paper", centering=0.1, boundary=0.99),
@@ -167,7 +168,7 @@ def test_a_line_search_that_fails_is_said(monkeypatch):
 
     monkeypatch.setattr(ccp.Newton, "step", backwards)
     known, graph = heap()
-    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-6, fallback=False), options=PAPER)
+    result = ccp.solve(from_graph(known, graph), limits=Limits(1e-6, fallback=False), options=PAPER, **BY_PDIP)
     assert result.status is Status.STALLED
     assert "line search" in result.reason
     assert result.iterations == 0

@@ -82,9 +82,9 @@ def test_solutions_meet_the_law(law):
             resisted += most * np.linalg.norm(speed)
         assert y[c, 0] == pytest.approx(0.0 if law == ccp.COULOMB else resisted, abs=1e-6)
     with pytest.raises(ValueError, match="allowed are conic, auto, apgd"):
-        ccp.solve(problem, None, "pdip")
+        ccp.solve(problem, None, "pdip", law=ccp.RELAXATION)
     with pytest.raises(ValueError, match="allowed is body"):
-        ccp.solve(problem, None, "conic", newton=ccp.newton_for(SELF, "conic", "contact"))
+        ccp.solve(problem, None, "conic", newton=ccp.newton_for(SELF, "conic", "contact"), law=ccp.RELAXATION)
     with pytest.raises(ValueError, match="one for each of 6 contacts"):
         ccp.RollingProblem(SELF, r, mu, rho[1:], sigma, G=G)
 
@@ -94,9 +94,9 @@ def test_without_resistance_it_is_the_problem_of_friction():
     G, r = blocks(rng, 5, 7), rng.standard_normal((10, 3)) - [1, 0, 0]
     mu, none = np.full(5, 0.4), np.zeros(5)
     limits = ccp.Limits(1e-9, closing_work=np.inf)
-    with_moments = ccp.solve(ccp.RollingProblem(SELF, r, mu, none, none, G=G), None, "apgd", limits)
+    with_moments = ccp.solve(ccp.RollingProblem(SELF, r, mu, none, none, G=G), None, "apgd", limits, law=ccp.RELAXATION)
     plain = ccp.BlockRows(G.indptr[:6], G.indices[:10], G.blocks[:10], 7)
-    alone = ccp.solve(ccp.ConeProblem(SELF, r[:5], mu, G=plain), None, "apgd", limits)
+    alone = ccp.solve(ccp.ConeProblem(SELF, r[:5], mu, G=plain), None, "apgd", limits, law=ccp.RELAXATION)
     np.testing.assert_allclose(with_moments.impulse[:5], alone.impulse, atol=1e-6)
     assert not with_moments.impulse[5:].any()
 
@@ -128,7 +128,9 @@ def test_conic_finds_the_impulse_of_a_contact_alone():
     rows = 2 * count
     G = ccp.BlockRows(np.arange(rows + 1), np.arange(rows), np.tile(np.eye(3, 6), (rows, 1, 1)), rows)
     problem = ccp.RollingProblem(SELF, r, *some, G=G)
-    found = ccp.solve(problem, None, "conic", ccp.Limits(1e-10, closing_work=np.inf, fallback=False))
+    found = ccp.solve(
+        problem, None, "conic", ccp.Limits(1e-10, closing_work=np.inf, fallback=False), law=ccp.RELAXATION
+    )
     assert found.converged, found.reason
     exact = rolling.project_to(-r, np.concatenate(some[:2]), some[2], np.zeros_like(r))
     np.testing.assert_allclose(found.impulse, exact, atol=1e-9)

@@ -58,7 +58,7 @@ def test_impulses_scale_with_r(solver, factor):
     known, graph = heap(bodies=60)
     one, other = (from_graph(dataclasses.replace(known, r=size * known.r), graph) for size in (1.0, factor))
     tol = tolerance(solver, 1e-6)
-    usual, found = (ccp.solve(each, type=solver, limits=Limits(tol)) for each in (one, other))
+    usual, found = (ccp.solve(each, type=solver, limits=Limits(tol), law=ccp.RELAXATION) for each in (one, other))
     assert found.converged, found.reason
     assert found.iterations < 1.2 * usual.iterations + 10
     velocity = other.product(found.impulse) / factor + known.r
@@ -70,7 +70,7 @@ def test_reaches_the_known_optimum(solver, name, way):
     known, graph = heap(**PROBLEMS[name])
     problem = from_graph(known, graph) if way == "by its map" else from_matrix(known)
     tol = tolerance(solver)
-    check(known, problem, ccp.solve(problem, type=solver, limits=Limits(tol)), tol)
+    check(known, problem, ccp.solve(problem, type=solver, limits=Limits(tol), law=ccp.RELAXATION), tol)
 
 
 def test_contacts_that_share_no_body_are_solved_one_by_one():
@@ -83,7 +83,7 @@ def test_contacts_that_share_no_body_are_solved_one_by_one():
     together = Known(G @ G.T, r, mu, g, y)
     for solver in ccp.SOLVERS:
         # what some processors reach of 1e-9 is 1.2e-9
-        result = ccp.solve(from_graph(together, graph), type=solver, limits=Limits(1e-8, 100_000))
+        result = ccp.solve(from_graph(together, graph), type=solver, limits=Limits(1e-8, 100_000), law=ccp.RELAXATION)
         check(together, from_graph(together, graph), result, 1e-8)
         assert np.allclose(result.impulse, g, atol=1e-5)  # every N is regular: the impulses are unique
 
@@ -98,7 +98,7 @@ def test_one_contact_worked_out_by_hand(solver):
     mu = 0.5
     for s, expected in ((0.3, [1.0, -0.3, 0.0]), (2.0, [1.6, -0.8, 0.0])):
         problem = ccp.ConeProblem(SELF, np.array([[-1.0, s, 0.0]]), np.array([mu]), N=matrix(SELF, np.eye(3)))
-        result = ccp.solve(problem, type=solver, limits=Limits(1e-9))
+        result = ccp.solve(problem, type=solver, limits=Limits(1e-9), law=ccp.RELAXATION)
         assert np.allclose(result.impulse, [expected], atol=1e-7)
 
 
@@ -106,7 +106,7 @@ def test_one_contact_worked_out_by_hand(solver):
 def test_impulses_are_numbers_where_their_squares_overflow(solver):
     known, _ = heap()
     problem = from_matrix(dataclasses.replace(known, r=1e300 * known.r))
-    result = ccp.solve(problem, type=solver, limits=Limits(1e-4))
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-4), law=ccp.RELAXATION)
     assert np.isfinite(result.impulse).all()
 
 
@@ -114,7 +114,7 @@ def test_impulses_are_numbers_where_their_squares_overflow(solver):
 def test_no_contacts_are_solved(solver):
     graph = random_graph(0, 0, 3)
     problem = ccp.ConeProblem(SELF, np.zeros((0, 3)), np.zeros(0), G=graph.part(SELF))
-    result = ccp.solve(problem, type=solver)
+    result = ccp.solve(problem, type=solver, law=ccp.RELAXATION)
     assert (result.converged, result.reason, result.iterations) == (True, "no contacts", 0)
     assert result.impulse.shape == (0, 3)
 
@@ -129,7 +129,7 @@ def test_contacts_that_all_open_get_no_impulse(solver, mu):
     r[:, 0] = mu * np.hypot(r[:, 1], r[:, 2]) + rng.uniform(0.01, 1, 20)
     r[5] = [1.0, 0.0, 0.0]
     problem = ccp.ConeProblem(SELF, r, np.full(20, mu), G=graph.part(SELF))
-    result = ccp.solve(problem, np.ones((20, 3)), solver)
+    result = ccp.solve(problem, np.ones((20, 3)), solver, law=ccp.RELAXATION)
     assert (result.converged, result.reason) == (True, "no contact closes")
     assert np.array_equal(result.impulse, np.zeros((20, 3)))
     assert ccp.measure(problem, result.impulse).natural_residual == 0
@@ -142,7 +142,7 @@ def test_one_of_many_contacts_closes_a_little(solver):
     r = np.tile([1.0, 0.0, 0.0], (4, 1))
     r[2, 0] = -1e-6
     problem = ccp.ConeProblem(SELF, r, np.full(4, 0.3), N=matrix(SELF, N))
-    result = ccp.solve(problem, type=solver, limits=Limits(1e-6))
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-6), law=ccp.RELAXATION)
     assert result.converged
     assert result.impulse[2, 0] == pytest.approx(1e-6, rel=1e-5)
 
@@ -158,7 +158,7 @@ def test_sliding_without_friction_does_not_disturb_the_other_contacts(sliding):
     results = []
     for one in (known, dataclasses.replace(known, r=r, y=y)):
         problem = from_graph(one, graph)
-        results.append(ccp.solve(problem, limits=Limits(TOL)))
+        results.append(ccp.solve(problem, limits=Limits(TOL), type="pdip", law=ccp.RELAXATION))
         check(one, problem, results[-1])
     assert results[0].iterations == results[1].iterations
     assert np.allclose(results[0].impulse, results[1].impulse, rtol=0, atol=1e-9 * sliding)
@@ -172,7 +172,7 @@ def test_bodies_of_very_different_mass(solver, seed, database):
     known, graph = heap(seed, mass_ratio=1e4)
     problem = from_graph(known, graph)
     tol = tolerance(solver, 1e-5)
-    check(known, problem, ccp.solve(problem, type=solver, limits=Limits(tol)), tol)
+    check(known, problem, ccp.solve(problem, type=solver, limits=Limits(tol), law=ccp.RELAXATION), tol)
 
 
 def in_units(known: Known, a: float, b: float) -> Known:
@@ -187,8 +187,8 @@ def test_units_that_are_powers_of_two_change_nothing_but_the_units(solver, a, b)
     known, _ = heap(2)
     problem = from_matrix(in_units(known, a, b))
     limits = Limits(tolerance(solver, 1e-6))
-    plain = ccp.solve(from_matrix(known), type=solver, limits=limits)
-    scaled = ccp.solve(problem, type=solver, limits=limits)
+    plain = ccp.solve(from_matrix(known), type=solver, limits=limits, law=ccp.RELAXATION)
+    scaled = ccp.solve(problem, type=solver, limits=limits, law=ccp.RELAXATION)
     rounding = 1e-6 if solver in ("conic", "auto") else 0.0  # auto may go over to conic
     assert scaled.history == pytest.approx(plain.history, rel=rounding, abs=0.0)
     assert np.allclose(scaled.impulse, b / a * plain.impulse, rtol=rounding, atol=rounding * b / a)
@@ -199,9 +199,9 @@ def test_a_start_near_the_solution_leads_to_the_same(solver):
     known, graph = heap()
     problem = from_graph(known, graph)
     tol = tolerance(solver)
-    check(known, problem, ccp.solve(problem, known.g, solver, Limits(tol)), tol)
+    check(known, problem, ccp.solve(problem, known.g, solver, Limits(tol), law=ccp.RELAXATION), tol)
     rough = known.g * np.random.default_rng(0).uniform(0, 2, (40, 1))
-    check(known, problem, ccp.solve(problem, rough, solver, Limits(tol)), tol)
+    check(known, problem, ccp.solve(problem, rough, solver, Limits(tol), law=ccp.RELAXATION), tol)
 
 
 # -- ends without a solution --------------------------------------------------------------------------------
@@ -212,7 +212,7 @@ def test_a_start_near_the_solution_leads_to_the_same(solver):
 def test_giving_up_is_said_and_leaves_an_impulse_in_the_cones(solver, max_it):
     known, graph = heap()
     problem = from_graph(known, graph)
-    result = ccp.solve(problem, type=solver, limits=Limits(1e-8, max_it, fallback=False))
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-8, max_it, fallback=False), law=ccp.RELAXATION)
     assert not result.converged
     newton = ccp.SOLVERS[solver].needs == NEWTON
     assert str(max_it if newton else result.iterations) in result.reason
@@ -238,12 +238,12 @@ def test_giving_up_is_said_and_leaves_an_impulse_in_the_cones(solver, max_it):
 def test_systems_that_the_asked_for_method_cannot_solve_are_solved_and_counted(options, database):
     known, graph = heap()
     problem = from_graph(known, graph)
-    expected = ccp.solve(problem, limits=Limits(1e-6))
+    expected = ccp.solve(problem, limits=Limits(1e-6), type="pdip", law=ccp.RELAXATION)
     for name in database.getAll():
         database.delValue(name)
     for name, value in options.items():
         database[name] = value
-    result = ccp.solve(problem, limits=Limits(1e-6))
+    result = ccp.solve(problem, limits=Limits(1e-6), type="pdip", law=ccp.RELAXATION)
     check(known, problem, result, 1e-6)
     assert 0 < result.fallbacks <= 2 * result.iterations  # a Newton step solves one system or two
     assert abs(result.iterations - expected.iterations) <= 3
@@ -271,7 +271,7 @@ def test_the_answer_does_not_depend_on_the_ranks(solver):
         (known, from_graph(known, graph, comm, [0] * last + [40], [12] * comm.size)),  # uneven
         (few, from_graph(few, few_graph, comm)),
     ):
-        result = ccp.solve(problem, type=solver, limits=limits)
+        result = ccp.solve(problem, type=solver, limits=limits, law=ccp.RELAXATION)
         figures = ccp.measure(problem, result.impulse)
         said = (figures, result.converged, result.reason, result.iterations, result.history)
         assert comm.allgather(said) == [said] * comm.size
@@ -280,6 +280,6 @@ def test_the_answer_does_not_depend_on_the_ranks(solver):
         assert figures.velocity_norm == pytest.approx(np.linalg.norm(optimum.y), rel=1e-3)
         assert result.fallbacks == 0
         if solver == "pdip":  # an iteration more or less is rounding
-            alone = ccp.solve(from_matrix(optimum), type=solver, limits=limits)
+            alone = ccp.solve(from_matrix(optimum), type=solver, limits=limits, law=ccp.RELAXATION)
             assert abs(result.iterations - alone.iterations) <= 1
         problem.destroy()

@@ -42,7 +42,7 @@ def squeezed(closing, angle: float, mu: float, compliance: float = 0.0) -> ccp.C
 def test_a_sphere_that_cannot_get_out_of_closing_walls(solver, closing, angle, mu):
     for units in (1.0, 2.0**20):
         problem = squeezed(np.multiply(closing, units), angle, mu)
-        result = ccp.solve(problem, type=solver, limits=Limits(1e-6))
+        result = ccp.solve(problem, type=solver, limits=Limits(1e-6), law=ccp.RELAXATION)
         assert not result.converged
         assert result.status is Status.UNBOUNDED
         assert result.reason.startswith("unbounded: ")
@@ -61,7 +61,7 @@ def test_a_sphere_that_cannot_get_out_of_closing_walls(solver, closing, angle, m
 )
 def test_a_sphere_that_can(solver, closing, angle, mu):
     problem = squeezed(closing, angle, mu)
-    result = ccp.solve(problem, type=solver, limits=Limits(1e-4))
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-4), law=ccp.RELAXATION)
     assert result.converged, result.reason
     assert "unbounded" not in result.reason
     assert ccp.measure(problem, result.impulse).natural_residual <= 1.01e-4
@@ -70,7 +70,7 @@ def test_a_sphere_that_can(solver, closing, angle, mu):
 @SOLVERS
 def test_any_compliance_makes_it_bounded(solver):
     problem = squeezed((1.0, 1.0), 0.0, 0.5, compliance=1e-3)
-    result = ccp.solve(problem, type=solver, limits=Limits(1e-7))
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-7), law=ccp.RELAXATION)
     assert result.converged, result.reason
     # each of both yields with closing speed 1 = C_n g_n
     assert result.impulse[:, 0] == pytest.approx(1.0 / problem.compliance[:, 0], rel=1e-3)
@@ -120,7 +120,7 @@ def test_a_heavy_body_is_no_sign_of_it(solver, ratio):
         G=BlockRows(np.array([0, 1, 3]), np.array([0, 0, 1]), np.array([light, top, press]), 2),
     )  # fmt: skip
     for problem, known in ((beside, ratio), (under, ratio)):
-        result = ccp.solve(problem, type=solver, limits=Limits(1e-6))
+        result = ccp.solve(problem, type=solver, limits=Limits(1e-6), law=ccp.RELAXATION)
         assert result.status is not Status.UNBOUNDED, result.reason
         g = np.zeros_like(problem.r)
         g[:, 0] = known if problem is under else np.append(np.ones(50), ratio)
@@ -131,9 +131,9 @@ def test_a_heavy_body_is_no_sign_of_it(solver, ratio):
 @pytest.mark.parametrize("speed", [1e-100, 1e-60])
 def test_the_unit_of_speeds_does_not_matter(solver, speed):
     problem = squeezed((speed, speed), 0.3, 0.2)
-    assert ccp.solve(problem, type=solver, limits=Limits(1e-4)).converged
+    assert ccp.solve(problem, type=solver, limits=Limits(1e-4), law=ccp.RELAXATION).converged
     problem = squeezed((speed, speed), 0.0, 0.5)
-    assert ccp.solve(problem, type=solver, limits=Limits(1e-6)).status is Status.UNBOUNDED
+    assert ccp.solve(problem, type=solver, limits=Limits(1e-6), law=ccp.RELAXATION).status is Status.UNBOUNDED
 
 
 def test_a_problem_given_by_its_matrix_is_recognised_too():
@@ -142,7 +142,7 @@ def test_a_problem_given_by_its_matrix_is_recognised_too():
     N[0, 3] = N[3, 0] = -1.0
     problem = ccp.ConeProblem(SELF, np.array([[-1.0, 0, 0], [0.5, 0, 0]]), np.full(2, 0.5), N=matrix(SELF, N))
     for solver in ("conic", "pdip", "apgd"):
-        result = ccp.solve(problem, type=solver, limits=Limits(1e-6))
+        result = ccp.solve(problem, type=solver, limits=Limits(1e-6), law=ccp.RELAXATION)
         assert (result.converged, result.reason.split(":")[0]) == (False, "unbounded")
 
 
@@ -167,8 +167,56 @@ def test_one_squeezed_sphere_among_many_contacts_on_several_ranks():
         indptr = np.concatenate([indptr, indptr[-1] + np.array([1, 2])])
         indices, data = np.concatenate([indices, [graph.bodies] * 2]), np.concatenate([data, blocks])
     squeezed = ccp.ConeProblem(comm, r, mu, G=BlockRows(indptr, indices, data, G.columns + last))
-    words = [ccp.solve(squeezed, type=name, limits=Limits(1e-6)).reason.split(":")[0] for name in ("conic", "apgd")]
+    words = [ccp.solve(
+        squeezed, type=name, limits=Limits(1e-6), law=ccp.RELAXATION
+    ).reason.split(":")[0] for name in ("conic", "apgd")]
     assert comm.allgather(words) == [words] * comm.size
     nothing = problem.natural_residual(np.full_like(problem.r, np.nan if comm.rank == 0 else 1.0), problem.r)
     assert words == ["unbounded", "unbounded"]
     assert nothing == np.inf
+
+
+@pytest.mark.parametrize("law", ccp.LAWS)
+@pytest.mark.parametrize("solver", ["pdip", "conic", "auto", "apgd", "kucera"])
+def test_a_contact_that_no_impulse_moves(solver, law):
+    """N has zeros in its rows: it must not close. With the relaxation it must not slide either; a small block of N is
+    no zero."""
+    rng = np.random.default_rng(0)
+    B = rng.normal(size=(15, 20))
+    r, limits = rng.normal(size=(5, 3)), Limits(1e-8)
+
+    def solved(small, fixed):
+        B[6:9] = small * rng.normal(size=(3, 20))
+        r[2] = fixed
+        return ccp.solve(ccp.ConeProblem(SELF, r, np.full(5, 0.4), N=B @ B.T), None, solver, limits, law=law)
+
+    closes = solved(0.0, [-0.3, 0.1, 0.2])
+    assert closes.status is Status.UNBOUNDED
+    assert "no impulse moves 1 contacts, which close" in closes.reason
+    slides = solved(0.0, [0.1, 0.6, 0.8])
+    if law == ccp.COULOMB:
+        assert slides.final
+        assert slides.status is not Status.UNBOUNDED
+    else:
+        assert slides.status is Status.UNBOUNDED
+    assert solved(0.0, [0.5, 0.6, 0.8]).converged
+    assert solved(1e-4, [-0.3, 0.1, 0.2]).converged
+
+
+@pytest.mark.parametrize("law", ccp.LAWS)
+@pytest.mark.parametrize("solver", ccp.SOLVERS)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_an_indefinite_N_is_a_status(solver, law):
+    for seed, share in ((0, 1e-2), (1, 0.1), (2, 1.0)):
+        rng = np.random.default_rng(seed)
+        A = rng.normal(size=(12, 12))
+        values, V = np.linalg.eigh(A @ A.T)
+        values[:4] = -share * values[-1]
+        N = V @ np.diag(values) @ V.T
+        result = ccp.solve(ccp.ConeProblem(SELF, rng.normal(size=(4, 3)), np.full(4, 0.5), N=N), type=solver, law=law)
+        assert isinstance(result.status, Status)
+        assert np.isfinite(result.impulse).all()
+    N = np.eye(6)
+    N[0, 0] = -1.0
+    result = ccp.solve(ccp.ConeProblem(SELF, -np.ones((2, 3)), np.full(2, 0.5), N=N), type=solver, law=law)
+    assert result.status in (Status.UNBOUNDED, Status.BREAKDOWN), result.reason

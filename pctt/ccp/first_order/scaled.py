@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dem.compiled import loop
 from dem.contact_map import ContactMap
 from pctt.ccp.cone import Array, FrictionCones
-from pctt.ccp.delassus import GivenMatrix
+from pctt.ccp.delassus import GivenOperator
 from pctt.ccp.problem import ConeProblem, Errors
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
@@ -38,7 +38,7 @@ class Awake(NamedTuple):
     """The contacts that iterations work on: all, or those that have not fallen asleep."""
 
     rows: Rows | None  #: (n,) of the arrays (nc, 3); None: all
-    operator: ContactMap | GivenMatrix
+    operator: ContactMap | GivenOperator
     cones: FrictionCones
     b: Array  #: (n, 3)
     compliance: Array  #: (n, 3), or no row for zero
@@ -138,7 +138,7 @@ class ScaledProblem:
         A contact too many costs iterations, but no accuracy. ``y`` (nc, 3) is the rigid gradient of all contacts.
         Returns what `wake` does, of those awake, with this gradient: fewer, side by side, move fewer bytes."""
         every = self._all
-        if isinstance(every.operator, GivenMatrix) or not every.operator.has_parts:
+        if isinstance(every.operator, GivenOperator) or not every.operator.has_parts:
             return now, last, new, y
         faster = float(5 * length / np.sqrt(max(self.problem.size, 1)))
         contacts = np.flatnonzero(self.cones.not_idle(now.x, last.x, y, faster))
@@ -272,6 +272,7 @@ class Progress:
         self._next_look = self.iterations + self.check
         residual = self._residual(x, gradient)
         self.history.append(residual)
+        self.limits.tell(self.iterations, residual)
         if residual < self.best or self._looks == 0:
             self.best, self._point = residual, x.copy()
         self._looks += 1

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from pctt.ccp.cone import TINY, Array
 from pctt.ccp.problem import ConeProblem
 
+INDEFINITE = "N is not positive semidefinite: a step has negative curvature"
+
 
 def useful_part(problem: ConeProblem, guess: Array) -> Array:
     """The part t guess, 0 <= t <= 1, of the guess (nc, 3) with the least objective.
@@ -23,6 +25,12 @@ def velocity(problem: ConeProblem, g: Array) -> Array:
     y = problem.product(g) + problem.r
     y[problem.mu == 0, 1:] = 0.0
     return y
+
+
+def is_indefinite(problem: ConeProblem, dg: Array, dy: Array) -> bool:
+    """Whether dg'N dg < 0 beyond rounding, for the velocities dy = N dg that a step dg (nc, 3) changes."""
+    curvature, square = problem.sum(np.array([np.vdot(dg, dy), np.vdot(dg, dg)]))
+    return bool(curvature < -1e-10 * problem.mean_diagonal * square)
 
 
 def hold(blocks: Array, free: NDArray[np.bool_], stiff: Array) -> None:

@@ -78,6 +78,7 @@ def solve(
         # residuals
         found, gap = cones.residuals(at), problem.dot(at.s, at.z)
         history.append(limits.residual(found.errors))
+        limits.tell(len(history) - 1, history[-1])
         unbounded = bool(why_unbounded(given, found.g, found.y))
         if unbounded or history[-1] == min(history):
             best = found.g

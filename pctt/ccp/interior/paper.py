@@ -33,7 +33,7 @@ from __future__ import annotations
 import numpy as np
 
 from pctt.ccp.cone import Array, step_to_zero
-from pctt.ccp.interior import hold, velocity
+from pctt.ccp.interior import INDEFINITE, hold, is_indefinite, velocity
 from pctt.ccp.newton import Newton
 from pctt.ccp.newton.kkt import KKT
 from pctt.ccp.problem import ConeProblem
@@ -52,16 +52,22 @@ def solve(
     aim = problem.norm(velocity(problem, g)) * problem.norm(g) / m  # 1/t
     lam = -aim / constraints(g, mu)
     history, step = list[float](), 1.0
+    last_g, last_y = g, velocity(problem, g)
     for iteration in range(limits.max_it + 1):
         y, f, df = velocity(problem, g), constraints(g, mu), gradients(g, mu)
         errors = problem.errors(g, y)
         history.append(limits.residual(errors))
+        limits.tell(iteration, history[-1])
         if history[-1] <= limits.tol:
             status, reason = Status.CONVERGED, limits.met
             break
         if iteration == limits.max_it:
             status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
             break
+        if is_indefinite(problem, g - last_g, y - last_y):
+            status, reason = Status.BREAKDOWN, INDEFINITE
+            break
+        last_g, last_y = g, y
         if step >= 0.5:
             aim = target * problem.sum(-np.vdot(f, lam)) / m
         r_g, r_lam = y + np.einsum("ck,cki->ci", lam, df), -lam * f - aim

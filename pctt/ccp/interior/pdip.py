@@ -23,7 +23,7 @@ from typing import NamedTuple, Optional
 import numpy as np
 
 from pctt.ccp.cone import Array, dot, step_to_boundary, step_to_zero, times
-from pctt.ccp.interior import hold, paper, useful_part, velocity
+from pctt.ccp.interior import INDEFINITE, hold, is_indefinite, paper, useful_part, velocity
 from pctt.ccp.newton import Newton
 from pctt.ccp.newton.kkt import KKT
 from pctt.ccp.problem import ConeProblem
@@ -112,17 +112,23 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
     history: list[float] = []
     earlier: deque[Array] = deque(maxlen=3)
     step, damping = 1.0, 0.0
+    last_g, last_y = g, velocity(problem, g)
     for iteration in range(limits.max_it + 1):
         # residuals
         y = velocity(problem, g)
         errors = problem.errors(g, y)
         history.append(limits.residual(errors))
+        limits.tell(iteration, history[-1])
         if history[-1] <= limits.tol:
             status, reason = Status.CONVERGED, limits.met
             break
         if iteration == limits.max_it:
             status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
             break
+        if is_indefinite(problem, g - last_g, y - last_y):
+            status, reason = Status.BREAKDOWN, INDEFINITE
+            break
+        last_g, last_y = g, y
         # linearisation
         f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
         aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t

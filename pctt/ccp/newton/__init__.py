@@ -66,6 +66,7 @@ class Newton:
         self.ksp_systems = 0
         self._structure: tuple | None = None  # of the system's problem
         self._instead = False  # of the bodies' form, which the present problem has not
+        self._has_entries = True  # the present problem's N
         self._linear: LinearSolver | None = None
         self._looked: tuple[Any, tuple[GivenMatrix, Order] | None] = (None, None)
 
@@ -75,11 +76,8 @@ class Newton:
         Returns the problem as its systems know it: given by N where its contacts are few, by the rows of its map where
         joints or a cell couple bodies."""
         problem = problem.by_rows()
-        few = self._few(problem)
-        instead = self.form == "body" and (few is not None or problem.contact_map is None)
-        if instead != self._instead:
-            self.destroy()
-            self._instead = instead
+        few = self._prepare(problem)
+        instead = self._instead
         self.problem = problem if few is None else problem.by_matrix(few[0])
         structure, last = problem.structure(), self._structure or ()
         same = len(structure) == len(last) and all(map(np.array_equal, structure, last))
@@ -96,6 +94,26 @@ class Newton:
                 self.system = FORMS["contact" if instead else self.form](problem)
         self._structure = structure
         return self.problem
+
+    def check(self, problem: ConeProblem) -> None:
+        """ValueError if the problem is given by products, and the preconditioner reads entries."""
+        if problem.has_entries:
+            return
+        self._prepare(problem)
+        if self.linear.reads_entries:
+            raise ValueError(
+                f"{self.linear.words()} reads entries, but N is given by its products; allowed are the preconditioners "
+                "none, jacobi and pbjacobi"
+            )
+
+    def _prepare(self, problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:
+        """Choose how the problem's systems are solved; N and an order of elimination where contacts are few."""
+        few = self._few(problem)
+        instead = self.form == "body" and (few is not None or problem.contact_map is None)
+        if (instead, problem.has_entries) != (self._instead, self._has_entries):
+            self.destroy()
+            self._instead, self._has_entries = instead, problem.has_entries
+        return few
 
     def has_few(self, problem: ConeProblem) -> bool:
         """Whether the systems of this problem get the factors of `FewForm`."""
@@ -123,10 +141,11 @@ class Newton:
         """What solves the systems of the present form."""
         if self._linear is None:
             own = self.form == "body" and not self._instead and self._own
-            defaults = GIVEN if self._instead else DEFAULTS[self.form]
+            form = "contact" if self._instead else self.form
+            defaults = GIVEN if self._instead and self._has_entries else DEFAULTS[form]
             free = self.compare is None and OWN + "pc_type" not in options_database()
-            incomplete = self.form == "contact" and free
-            self._linear = LinearSolver(self.comm, defaults, self.compare, own, incomplete)
+            incomplete = self.form == "contact" and free and self._has_entries
+            self._linear = LinearSolver(self.comm, defaults, self.compare, own, incomplete, self._has_entries)
         return self._linear
 
     @property
@@ -219,11 +238,11 @@ class Newton:
 
     def _least(self, left: Array, products: Array, b: Array) -> Array:
         """The coefficients of the combination of ``products`` (k, rows) whose difference from b is orthogonal to all of
-        ``left``; zeros if the sums are no numbers."""
+        ``left``; zeros if the sums are no numbers, or the matrix is not positive."""
         sums = self.problem.sum(np.column_stack([left @ products.T, left @ b]))
-        if not np.isfinite(sums).all():
-            return np.zeros(len(products))
         energies, works = sums[:, :-1], sums[:, -1]
+        if not np.isfinite(sums).all() or (np.diagonal(energies) < 0.0).any():
+            return np.zeros(len(products))
         size = np.sqrt(np.maximum(np.diagonal(energies), TINY))
         # scaled, as solutions shrink from one Newton step to the next; of nearly parallel ones only the sum counts
         return np.linalg.lstsq(energies / np.outer(size, size), works / size, rcond=1e-10)[0] / size
@@ -262,10 +281,13 @@ class Newton:
 
 def _eliminated(problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:
     """N and the order of `pctt.ccp.newton.few` of a problem on one rank, if it is cheap enough."""
+    if not problem.has_entries:
+        return None
     if isinstance(problem.operator, GivenMatrix):
         known = problem.operator
     else:
-        G = problem.operator.block_rows
+        assert problem.contact_map is not None
+        G = problem.contact_map.block_rows
         if np.square(np.bincount(G.indices)).sum() > 2 * Settings.pairs + len(G.indices):
             return None
         known = GivenMatrix(problem.comm, all_blocks(G))

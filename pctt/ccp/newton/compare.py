@@ -76,9 +76,14 @@ class Comparison:
         x.array[:] = kept
         return chosen
 
+    @property
+    def reads_entries(self) -> bool:
+        """Whether any of the preconditioners reads entries beside the diagonal blocks."""
+        return any(self._solver(name).needs_entries for name in self.names)
+
     def _make_entries(self, A: PETSc.Mat, P: Source) -> None:
         """Where A is a function, its entries, once for all that read them: no one's set-up."""
-        if callable(P) and shell_of(A) and any(self._solver(name).needs_entries for name in self.names):
+        if callable(P) and shell_of(A) and self.reads_entries:
             start = time.perf_counter()
             P()
             self._entries_s += time.perf_counter() - start

@@ -59,6 +59,7 @@ class LinearSolver:
     incomplete : whether incomplete factors take over from block Jacobi while that would take long. Systems are hard in
         the middle of a problem, and iteration counts tell here too
     compare : its preconditioners are tried in place of the KSP
+    entries : whether systems have them: else nothing but a KSP works on them
 
     Attributes
     ----------
@@ -72,8 +73,10 @@ class LinearSolver:
         compare: Comparison | None = None,
         own: bool = False,
         incomplete: bool = False,
+        entries: bool = True,
     ):
         self.comm, self.defaults, self.compare, self.own, self.incomplete = comm, defaults, compare, own, incomplete
+        self._entries = entries
         self._krylov: dict[tuple[str, bool], Krylov] = {}
         self._symmetric = True
         self.begin()
@@ -101,7 +104,7 @@ class LinearSolver:
         if first and first.converged:
             return True
         self._hard, before = self.own, x.array.copy()
-        last = self._by_factor(b, x, rtol)
+        last = self._by_factor(b, x, rtol) if self._entries else None
         self.fallbacks += not (self.own and last and last.converged)
         if first and (last is None or first.true_residual < last.true_residual):
             last, x.array[:] = first, before
@@ -181,6 +184,11 @@ class LinearSolver:
                     options["ksp_max_it"] = str(most)
             self._krylov[name, symmetric] = Krylov(self.comm, OWN + "fallback_" * (name == "factor"), options)
         return self._krylov[name, symmetric]
+
+    @property
+    def reads_entries(self) -> bool:
+        """Whether the preconditioner reads entries beside the diagonal blocks."""
+        return self._solver("").needs_entries or (self.compare is not None and self.compare.reads_entries)
 
     def report(self) -> list[str]:
         """Lines about the preconditioner, if it is one of this package."""

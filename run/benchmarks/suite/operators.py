@@ -84,7 +84,7 @@ class Solver:
         self.sim.close()
 
     def time_solve(self, solver: str, tol: float) -> None:
-        self.result = ccp.solve(self.problem, None, solver, self.limits)
+        self.result = ccp.solve(self.problem, None, solver, self.limits, law=ccp.RELAXATION)
 
     def track_iterations(self, solver: str, tol: float) -> int:
         return self.result.iterations
