@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import structural_rank
 from scipy.sparse.linalg import LinearOperator, splu
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
-from dem.exchange import on_any, refuse
+from dem.exchange import on_any, reduced, refuse
 from pctt.ccp.cone import Array
 from pctt.ccp.delassus import BlockMap, ColumnMap, GivenMatrix, GivenOperator, rows_of
 
@@ -80,13 +80,13 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, **rest: Any) -> Contacts:
     contact of the plane has the friction 0 along its second tangent, in which nothing moves."""
     words = _wrong_contacts(r, mu, **rest)
     velocity, friction = (np.zeros(0), np.zeros(0)) if words else (np.asarray(each, dtype=float) for each in (r, mu))
-    here = velocity.size > 0
-    flat = here and velocity.ndim == 2 and velocity.shape[1] == 2
-    wrong, plane, space, elliptic = on_any(comm, bool(words), flat, here and not flat, friction.ndim == 2)
+    flat, space = velocity.ndim == 2 and velocity.shape[1] == 2, velocity.ndim == 2 and velocity.shape[1] == 3
+    space = space or (velocity.ndim == 1 and velocity.size > 0)
+    wrong, plane, space, elliptic = on_any(comm, bool(words), flat, space, friction.ndim == 2)
     if wrong:
         refuse(comm, words)
     if plane and space:
-        raise ValueError("r has rows of 2 numbers on some ranks and rows of 3 on others; allowed is one of both")
+        raise ValueError("r has 2 columns on some ranks and 3 on others; allowed is one of both")
     width = 2 if plane else 3
     velocity, friction = np.ascontiguousarray(velocity.reshape(-1, width)), np.ascontiguousarray(friction)
     if not elliptic and not plane:
@@ -230,16 +230,17 @@ def _by_N(comm: MPI.Comm, nc: int, width: int, N: Any) -> GivenOperator:  # noqa
 
 
 def _unlike(N: GivenMatrix) -> tuple[float, float]:
-    """The largest row sum of |N - N'|, and of |N|; the same on all ranks."""
+    """The largest |N_ij - N_ji|, and the largest |N_ij|; the same on all ranks."""
     if N.comm.size == 1:
-        rows = N.local.tocsr()
-        different, rows = abs(rows - rows.T), abs(rows)
-        return (float(different.sum(axis=1).max()), float(rows.sum(axis=1).max())) if N.rows else (0.0, 0.0)
-    other = N.mat.transpose(PETSc.Mat())
-    other.axpy(-1.0, N.mat, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-    norms = other.norm(PETSc.NormType.INFINITY), N.mat.norm(PETSc.NormType.INFINITY)
-    other.destroy()
-    return norms
+        different = (N.local - N.local.T).data
+    else:
+        other = N.mat.transpose(PETSc.Mat())
+        other.axpy(-1.0, N.mat, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        different = rows_of(other).data
+        other.destroy()
+    largest = [max(each.max(initial=0.0), -each.min(initial=0.0)) for each in (different, N.local.data)]
+    unlike, most = reduced(N.comm, [], largest)[1]
+    return unlike, most
 
 
 def _by_products(comm: MPI.Comm, nc: int, width: int, N: Any) -> GivenOperator:  # noqa: N803
@@ -389,11 +390,11 @@ def _masses(comm: MPI.Comm, masses: Any, n: int) -> Array | tuple[Solve, bool]:
 
 def _by_matrix(comm: MPI.Comm, masses: Any, n: int) -> Array | tuple[Solve, bool]:
     """Of masses as an array or a scipy matrix."""
+    M, wrong = np.ones(n), ""
     try:
         M = masses if sp.issparse(masses) else _real(masses)
-    except (TypeError, ValueError):
-        M = np.full(1, np.nan)
-    wrong = ""
+    except (TypeError, ValueError) as error:
+        wrong = f"masses are no numbers: {error}"
     if M.shape not in ((n,), (n, n)):
         wrong = (
             f"masses: {type(masses).__name__} of shape {M.shape}; allowed are {(n,)} or {(n, n)} numbers, as G has {n} "

@@ -208,6 +208,20 @@ def test_a_preconditioner_that_reads_entries_is_refused_for_an_operator(type, ki
     PETSc.Options()["ccp_pc_type"] = kind
     with pytest.raises(ValueError, match=f"{kind} reads entries, but N is given by its products; allowed are"):
         ccp.solve(case.problem(N=PRODUCTS["function"](case)), type=type)
+    PETSc.Options().delValue("ccp_pc_type")
+    newton = ccp.newton_for(SELF, "pdip", compare=ccp.Comparison(SELF, ["none", kind]))
+    with pytest.raises(ValueError, match=f"the preconditioner {kind} reads entries"):
+        ccp.solve(case.problem(N=PRODUCTS["function"](case)), type="pdip", newton=newton)
+
+
+@pytest.mark.parametrize("form", ["contact", "kkt", "body"])
+def test_newton_systems_go_from_entries_to_products_and_back(form):
+    case = Case()
+    newton = ccp.newton_for(SELF, "pdip", form)
+    limits = ccp.Limits(1e-7, fallback=False)
+    for given in [{"N": PRODUCTS["function"](case)}, {"N": case.N}, {"G": case.G, "masses": case.M}] * 2:
+        assert ccp.solve(case.problem(**given), None, "pdip", limits, None, newton, ccp.RELAXATION).converged
+    newton.destroy()
 
 
 def check_law(g, y, mu, law):

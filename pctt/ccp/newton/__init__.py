@@ -100,10 +100,10 @@ class Newton:
         if problem.has_entries:
             return
         self._prepare(problem)
-        if self.linear.reads_entries:
+        if readers := self.linear.readers:
             raise ValueError(
-                f"{self.linear.words()} reads entries, but N is given by its products; allowed are the preconditioners "
-                "none, jacobi and pbjacobi"
+                f"the preconditioner {readers[0]} reads entries, but N is given by its products; allowed are none, "
+                "jacobi and pbjacobi"
             )
 
     def _prepare(self, problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:

@@ -77,13 +77,13 @@ class Comparison:
         return chosen
 
     @property
-    def reads_entries(self) -> bool:
-        """Whether any of the preconditioners reads entries beside the diagonal blocks."""
-        return any(self._solver(name).needs_entries for name in self.names)
+    def readers(self) -> list[str]:
+        """The preconditioners that read entries beside the diagonal blocks."""
+        return [name for name in self.names if self._solver(name).needs_entries]
 
     def _make_entries(self, A: PETSc.Mat, P: Source) -> None:
         """Where A is a function, its entries, once for all that read them: no one's set-up."""
-        if callable(P) and shell_of(A) and self.reads_entries:
+        if callable(P) and shell_of(A) and self.readers:
             start = time.perf_counter()
             P()
             self._entries_s += time.perf_counter() - start

@@ -186,9 +186,11 @@ class LinearSolver:
         return self._krylov[name, symmetric]
 
     @property
-    def reads_entries(self) -> bool:
-        """Whether the preconditioner reads entries beside the diagonal blocks."""
-        return self._solver("").needs_entries or (self.compare is not None and self.compare.reads_entries)
+    def readers(self) -> list[str]:
+        """The preconditioners that read entries beside the diagonal blocks."""
+        usual = self._solver("")
+        compared = [] if self.compare is None else self.compare.readers
+        return [usual.kind] * usual.needs_entries + compared
 
     def report(self) -> list[str]:
         """Lines about the preconditioner, if it is one of this package."""
