@@ -252,7 +252,7 @@ def half_space():
 
 @pytest.mark.parametrize("coupled", [False, True])
 def test_the_half_space_has_the_displacements_of_point_forces_far_away(half_space, coupled):
-    """Boussinesq and Cerruti (Johnson 3.19, 3.75), and N is symmetric and positive definite."""
+    """Boussinesq and Cerruti (Johnson, sections 3.2, 3.6), and N is symmetric and positive definite."""
     n, a, nu = 8, 0.01, half_space.NU
     K = half_space.influence(n, a, coupled)
     x, y = -5 * a, 6 * a
@@ -311,6 +311,23 @@ def test_each_point_of_a_rough_ball_obeys_the_law_of_friction(half_space):
         assert touching < 0.9 * np.pi * half_space.Theory.radius**2
 
 
+def test_a_rough_ball_has_the_pressures_of_tamaas(half_space):
+    """Without friction it is the problem of Polonsky and Keer 1999, whose conjugate gradients tamaas has."""
+    tamaas = pytest.importorskip("tamaas", reason="tamaas is not installed")
+    n, kinds = 48, tamaas.model_type
+    heights = half_space.roughness(n)
+    (state,) = half_space.press_and_shift(heights, np.zeros(1), tol=1e-8)
+    model = tamaas.ModelFactory.createModel(kinds.basic_2d, [half_space.LENGTH] * 2, [n, n])
+    model.E, model.nu = half_space.G / (1 - half_space.NU), 0.0  # of both bodies together
+    tamaas.ModelFactory.registerNonPeriodic(model, "dcfft")
+    ball = heights - (half_space.points(n) ** 2).sum(axis=2) / (2 * half_space.RADIUS)
+    solver = tamaas.PolonskyKeerRey(model, np.ascontiguousarray(ball), 1e-12)
+    solver.setIntegralOperator("dcfft")
+    solver.solve(state.totals[0] / half_space.LENGTH**2)
+    expected = np.asarray(model.traction) * (half_space.LENGTH / n) ** 2
+    np.testing.assert_allclose(state.force[..., 0], expected, atol=1e-6 * expected.max())
+
+
 @pytest.fixture(scope="module")
 def block():
     pytest.importorskip("skfem", reason="scikit-fem is not installed (extra `examples`)")
@@ -348,7 +365,7 @@ def test_a_block_sticks_then_slides_with_the_force_of_its_friction(block, capsys
         assert (size <= limit * (1 + 1e-9)).all()
         work = (force[:, 1:] * slip).sum()  # the greatest that friction can take
         assert work == pytest.approx(-(limit * np.linalg.norm(slip, axis=1)).sum(), rel=1e-6, abs=1e-7 * force.max())
-    sticking = [(state.zones == 2).sum() for state in states[1:]]
+    sticking = [state.result.counts.sticking for state in states[1:]]
     assert sticking == sorted(sticking, reverse=True)
     assert sticking[0] > sticking[-1] == 0  # the part that sticks shrinks
     shear, normal = -states[-1].force[:, 1].sum(), states[-1].force[:, 0].sum()

@@ -44,13 +44,6 @@ class State(NamedTuple):
     held: np.ndarray
     result: ccp.Result
 
-    @property
-    def zones(self) -> np.ndarray:
-        """Of each contact (nc,): 0 open, 1 it slides, 2 it sticks."""
-        most = FRICTION * self.force[:, 0]
-        sticks = np.linalg.norm(self.force[:, 1:], axis=1) < (1 - 1e-3) * most
-        return np.where(most > 1e-6 * most.max(), 1 + sticks, 0)
-
 
 class Block:
     """Trilinear elements, so many along the height. The nodes of the bottom may touch the floor z = 0.
@@ -79,18 +72,17 @@ class Block:
         rows = number[[2, 0, 1]][:, self.floor].T.ravel()  # normal and tangents of each contact
         G = sp.identity(self.K.shape[0], format="csr")[rows][:, free]
         stiffness = self.K[free][:, free]
-        factor, given = splu(stiffness.tocsc()), {"G": G, "masses": stiffness}
-        states, before, guess = [], np.zeros((len(self.floor), 3)), None
+        factor, before, guess, states = splu(stiffness.tocsc()), np.zeros((len(self.floor), 3)), None, []
+        problem = ccp.ConeProblem(MPI.COMM_SELF, before, self.mu, G=G, masses=stiffness)
         for way in ways:
             u = np.zeros(self.K.shape[0])
             u[held] = np.broadcast_to(way[:, None], number.shape)[self.held]
             u[free] = -factor.solve(self.K[free] @ u)  # without contact
-            r = u[rows].reshape(-1, 3) - before
-            problem = ccp.ConeProblem(MPI.COMM_SELF, r, self.mu, **given)
+            problem = problem.with_velocities(u[rows].reshape(-1, 3) - before)
             result = ccp.solve(problem, guess, limits=ccp.Limits(tol))
             if not result.converged:
                 raise RuntimeError(f"top at {way} mm: {result.reason}")
-            given, guess = {"N": problem.N}, result.impulse
+            guess = result.impulse
             u[free] += factor.solve(G.T @ guess.ravel())
             before = u[rows].reshape(-1, 3) * [0, 1, 1]  # the gap is the whole displacement, slip what is new of it
             reactions = (self.K @ u)[number] * self.held
@@ -118,10 +110,10 @@ def main(high: int, picture: str = "") -> list[State]:
     print(f"{len(block.floor)} contacts of {block.mesh.nvertices} nodes, friction {FRICTION}")
     print("shift mm  iterations  normal N  shear N  shear / normal  open  slides  sticks  balance N")
     for state in states:
-        force, zones = state.force.sum(axis=0), np.bincount(state.zones, minlength=3)
+        force, (opened, slides, sticks) = state.force.sum(axis=0), state.result.counts
         balance = np.abs(state.held + force[[1, 2, 0]]).max()
         print(f"{state.way[0]:8.2f} {state.result.iterations:11} {force[0]:9.3f} {-force[1]:8.3f} "
-              f"{-force[1] / force[0]:15.4f} {zones[0]:5} {zones[1]:7} {zones[2]:7} {balance:10.1e}")  # fmt: skip
+              f"{-force[1] / force[0]:15.4f} {opened:5} {slides:7} {sticks:7} {balance:10.1e}")  # fmt: skip
     if picture:
         draw(block, states, picture)
     return states
@@ -145,7 +137,7 @@ def draw(block: Block, states: list[State], picture: str) -> None:
         stress = side.contourf(*moved[[0, 2]][:, face], block.stress(state.u)[face], levels, extend="max")
         side.axhline(0, color="black")
         side.set(xlim=(-3, 45), ylim=(-3, 32), aspect="equal", xlabel="x [mm]", ylabel="z [mm]", title=name)
-        zones = floor.pcolormesh(along, across, state.zones.reshape(grid), cmap=colours, vmin=-0.5, vmax=2.5)
+        zones = floor.pcolormesh(along, across, state.result.states.reshape(grid), cmap=colours, vmin=-0.5, vmax=2.5)
         floor.quiver(*x[:2, block.floor], *(state.force[:, 1:].T / block.area), width=0.004)
         floor.set(xlim=(-3, 45), aspect="equal", xlabel="x [mm]", ylabel="y [mm]", title="friction on the block")
         pressure, area = (each.reshape(grid).sum(axis=0) for each in (state.force[:, 0], block.area))

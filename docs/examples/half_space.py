@@ -27,7 +27,8 @@ def influence(n: int, a: float, coupled: bool = False) -> np.ndarray:
     point from the square that lies i, j squares before it, negative ones wrapped. The axes are the normal and both
     tangents.
 
-    The sources are Love 1929 for pressure (Boussinesq) and Cerruti for shear, as sums over the corners of a square. Two
+    Love 1929 has them for pressure (Boussinesq) as sums over the corners of a square, and so are those for shear
+    (Cerruti; Johnson, sections 3.2, 3.6). Two
     bodies of one material have twice the diagonal blocks and no coupling of normal and tangents; ``coupled``: the other
     body is rigid.
     """
@@ -78,11 +79,19 @@ def roughness(n: int, rms: float = 1.2e-6, hurst: float = 0.8, longest: float = 
 
 
 class State(NamedTuple):
-    """After a step: shift of the ball [m], forces (n, n, 3) on the plane [N], slip against the ball (n, n, 2) [m]."""
+    """After a step.
+
+    shift : of the ball [m]
+    force : (n, n, 3) on the plane [N]
+    slip : (n, n, 2) of the plane against the ball, since it was pressed [m]
+    zones : (n, n) 0 open, 1 slides, 2 sticks
+    iterations : of the solver
+    """
 
     shift: float
     force: np.ndarray
     slip: np.ndarray
+    zones: np.ndarray
     iterations: int
 
     @property
@@ -90,35 +99,29 @@ class State(NamedTuple):
         """The forces of all points together, of the normal and both tangents [N]."""
         return self.force.sum(axis=(0, 1))
 
-    @property
-    def zones(self) -> np.ndarray:
-        """Of each point (n, n): 0 open, 1 it slides, 2 it sticks."""
-        most = FRICTION * self.force[..., 0]
-        sticks = np.linalg.norm(self.force[..., 1:], axis=2) < (1 - 1e-3) * most
-        return np.where(most > 1e-6 * most.max(), 1 + sticks, 0)
-
 
 def press_and_shift(heights: np.ndarray, shifts: np.ndarray, coupled: bool = False, tol: float = 1e-6) -> list[State]:
     """The states of a ball with rough ``heights`` (n, n) that is pressed by PRESSED and then shifted along x, by
     Coulomb's law for the increments of slip."""
     n = len(heights)
-    N = operator(n, influence(n, LENGTH / n, coupled))
+    N, mu = operator(n, influence(n, LENGTH / n, coupled)), np.full(n * n, FRICTION)
     gap = (points(n) ** 2).sum(axis=2).ravel() / (2 * RADIUS) - heights.ravel() - PRESSED
     states, slip, guess = [], np.zeros((n * n, 2)), None
+    problem = ccp.ConeProblem(MPI.COMM_SELF, np.zeros((n * n, 3)), mu, N=N)
     for shift in shifts:
-        r = np.column_stack([gap, -slip - [shift, 0.0]])
-        problem = ccp.ConeProblem(MPI.COMM_SELF, r, np.full(n * n, FRICTION), N=N)
+        problem = problem.with_velocities(np.column_stack([gap, -slip - [shift, 0.0]]))
         result = ccp.solve(problem, guess, limits=ccp.Limits(tol))
         if not result.converged:
             raise RuntimeError(f"shift {shift:g} m: {result.reason}")
         guess, slip = result.impulse, slip + result.velocity[:, 1:]
-        states.append(State(shift, guess.reshape(n, n, 3), slip.reshape(n, n, 2), result.iterations))
+        found = (each.reshape(n, n, -1).squeeze() for each in (guess, slip, result.states))
+        states.append(State(shift, *found, result.iterations))
     return states
 
 
 class Theory:
     """Two smooth balls of one material: Hertz 1882 for pressing, Cattaneo 1938 and Mindlin 1949 for the shift (Johnson,
-    equations 4.22 to 4.24, 7.38 to 7.42)."""
+    sections 4.2 and 7.2)."""
 
     radius = np.sqrt(RADIUS * PRESSED)  # of the contact [m]
     normal = 4 / 3 * G / (1 - NU) * np.sqrt(RADIUS) * PRESSED**1.5  # force [N]
@@ -156,7 +159,7 @@ def main(n: int, picture: str = "") -> dict[str, list[State]]:
     for name, states in runs.items():
         first = states[0]
         print(f"{name}: force {first.totals[0]:.4f} N, contact {(first.zones > 0).sum() * area:.4f} mm^2")
-        print("shift um  iterations  Q / mu P  (theory)  radius of stick / contact  (theory)")
+        print("shift um  iterations  Q / mu P  (smooth)  radius of stick / contact (smooth)")
         for shift, state in zip(shifts, states):
             share = state.totals[1] / (FRICTION * state.totals[0])
             stick = np.sqrt((state.zones == 2).sum() / (state.zones > 0).sum())

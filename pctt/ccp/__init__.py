@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows
@@ -172,21 +173,21 @@ def _measure(problem: ConeProblem, result: Result) -> Accuracy:
     rigid = problem.velocity_of(result.momentum)
     y = rigid + problem.compliance * result.impulse + problem.r
     result.velocity = y if problem.units is None else problem.velocities_by(result.impulse)
-    result.counts = _counts(problem, result.impulse, y, result.law != RELAXATION)
+    result.states = _states(problem, result.impulse, y, result.law != RELAXATION)
+    here = np.bincount(result.states, minlength=len(Counts._fields))
+    result.counts = Counts(*map(int, problem.sum(here)))
     result.accuracy = figures(problem, result.impulse, rigid)
     return result.accuracy
 
 
-def _counts(problem: ConeProblem, g: Array, y: Array, coulomb: bool) -> Counts:
-    """How many contacts are open, slide and stick: of each two numbers that are complementary, impulses in units of
-    velocities, the larger one decides. Collective."""
+def _states(problem: ConeProblem, g: Array, y: Array, coulomb: bool) -> NDArray[np.int8]:
+    """Which contacts (nc,) are open (0), slide (1) and stick (2): of each two numbers that are complementary, impulses
+    in units of velocities, the larger one decides."""
     nc, d, cones = problem.cones.count, problem.diagonal, problem.cones
     opening = y[:nc, 0] if coulomb else y[:nc, 0] - cones.resisted(y)
     open_ = d[:nc, 0] * g[:nc, 0] <= opening
     room = 0.5 * (d[:nc, 1] + d[:nc, 2]) * (problem.mu[:nc] * g[:nc, 0] - tangential(g[:nc]))
-    slides = ~open_ & (room < tangential(y[:nc]))
-    opened, sliding = map(int, problem.sum(np.array([open_.sum(), slides.sum()])))
-    return Counts(opened, sliding, problem.size - opened - sliding)
+    return np.where(open_, 0, np.where(room < tangential(y[:nc]), 1, 2)).astype(np.int8)
 
 
 def _print(comm: MPI.Comm, iterations: int, residual: float) -> None:

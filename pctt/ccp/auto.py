@@ -78,7 +78,7 @@ def solve(
             basin = max(limits.tol, options.basin)
             second = tried.conic(guess, conic.Conic(), 0.0 if small else basin)
             failed = small and second.status is not Status.GIVEN_UP and second.residual > basin
-            if failed and np.any(guess):  # a guess at the wall of its cones
+            if failed and problem.norm(guess) > 0.0:  # a guess at the wall of its cones
                 second = tried.conic(np.zeros_like(guess), conic.Conic())
             if failed and second.residual > basin:
                 tried.in_turns(options, basin)

@@ -91,7 +91,7 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, **rest: Any) -> Contacts:
     velocity, friction = np.ascontiguousarray(velocity.reshape(-1, width)), np.ascontiguousarray(friction)
     if not elliptic and not plane:
         return Contacts(3, None, velocity, friction, velocity)
-    velocity = _padded(velocity)
+    velocity = padded(velocity)
     both = friction if friction.ndim == 2 else np.stack([friction, 0 * friction if plane else friction], axis=1)
     most = both.max(axis=1, initial=0.0)
     units = np.ones((len(most), 3))
@@ -101,7 +101,14 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, **rest: Any) -> Contacts:
     return Contacts(width, units, units * velocity, most, velocity)
 
 
-def _padded(rows: Array) -> Array:
+def wrong_velocities(r: Any, shape: tuple[int, ...]) -> str:
+    """What is wrong with velocities r that are to have this shape; empty if nothing is."""
+    if np.shape(r) != shape:
+        return f"r has the shape {np.shape(r)}; allowed is {shape}"
+    return _wrong_contacts(r, np.zeros(shape[0]))
+
+
+def padded(rows: Array) -> Array:
     """The rows (nc, w), (nc, 3) with zeros."""
     out = np.zeros((len(rows), 3))
     out[:, : rows.shape[1]] = rows
@@ -262,7 +269,7 @@ def _by_products(comm: MPI.Comm, nc: int, width: int, N: Any) -> GivenOperator: 
         y = np.asarray(mult(np.ascontiguousarray(g[:, :width])), dtype=float)
         if y.size != nc * width:
             raise ValueError(f"N.mult returns the shape {y.shape}; allowed is {(nc, width)}")
-        return _padded(y.reshape(nc, width))
+        return padded(y.reshape(nc, width))
 
     in_space = np.zeros((nc, 3, 3))
     in_space[:, :width, :width] = blocks
@@ -343,14 +350,12 @@ def _by_solves(comm: MPI.Comm, G: sp.csr_matrix, solve: Solve, together: bool) -
         high = min(low + BATCH, end)
         own = slice(max(low, first), max(min(high, last), max(low, first)))
         X = solve(whole[low:high].T.toarray())[:, own.start - low : own.stop - low]  # (n, rows)
-        if not on_any(comm, not np.isfinite(X).all())[0]:
-            near = np.asarray(whole[own] @ X).reshape(-1, 3, X.shape[1] or 1)
-            for k in range((own.stop - own.start) // 3):
-                blocks[(own.start - first) // 3 + k] = near[k, :, 3 * k : 3 * k + 3]
-        else:
+        if on_any(comm, not np.isfinite(X).all())[0]:
             raise ValueError("masses: a solve returns a NaN or an infinite number")
+        k = np.arange((own.stop - own.start) // 3)
+        blocks[(own.start - first) // 3 + k] = (whole[own] @ X).reshape(len(k), 3, len(k), 3)[k, :, k, :]
         if count <= MOST:
-            kept.append(sp.csr_matrix(np.asarray(whole @ X).T))
+            kept.append(sp.csr_matrix((whole @ X).T))
             count += comm.allreduce(int(kept[-1].nnz))
     if count <= MOST:
         rows = sp.vstack([sp.csr_matrix((0, whole.shape[0])), *kept], format="csr")

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from dem.compiled import loop
 from dem.contact_map import BlockRows
-from dem.exchange import reduced
+from dem.exchange import reduced, refuse
 from pctt.ccp import door
 from pctt.ccp.cone import Array, FrictionCones
 from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, without_hubs
@@ -119,6 +119,18 @@ class ConeProblem:
 
     def _cones(self) -> FrictionCones:
         return FrictionCones(self.mu)
+
+    def with_velocities(self, r: Array) -> ConeProblem:
+        """The same problem with other velocities r, of the shape of the first ones; it shares all else, and is valid
+        until one of both is destroyed. ValueError on all ranks for another shape or what is no number."""
+        given = self._given_r[:, : self._width]
+        words = door.wrong_velocities(r, given.shape)
+        refuse(self.comm, words)
+        other = copy.copy(self)
+        other.__dict__.pop("N", None)
+        other._given_r = door.padded(np.asarray(r, dtype=float).reshape(given.shape))
+        other.r = other._given_r if self.units is None else self.units * other._given_r
+        return other
 
     # -- the user's units ------------------------------------------------------------------------------------
 

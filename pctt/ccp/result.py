@@ -10,6 +10,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple, Optional
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pctt.ccp.cone import Array
 from pctt.ccp.problem import Errors
@@ -149,7 +150,8 @@ class Result:
     law : RELAXATION, COULOMB or FIXED_POINT: the law of the impulses and of the residuals
     accuracy : the figures of the impulses; set by `pctt.ccp.solve`
     momentum : (6m,) G' g, or g where the problem is given by N, in the units of the cones; set by `pctt.ccp.solve`
-    counts : the open, sliding and sticking contacts of all ranks; set by `pctt.ccp.solve`
+    states : (nc,) of this rank's contacts: 0 open, 1 sliding, 2 sticking; set by `pctt.ccp.solve`
+    counts : the open, sliding and sticking contacts of all ranks
     beyond : iterations among them after the limits were met, towards the aim beyond these
     asked : what the asked method made of it, where another one had to follow; else None
     exhausted : whether it has tried the other methods, too
@@ -170,6 +172,7 @@ class Result:
     accuracy: Accuracy | None = None
     momentum: Array = field(default_factory=lambda: np.zeros(0))
     velocity: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    states: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     counts: Counts = Counts(0, 0, 0)
     beyond: int = 0
     asked: Result | None = None

@@ -171,14 +171,17 @@ def test_all_forms_on_any_ranks():
 
 
 @pytest.mark.parallel(1, 2)
-def test_a_map_whose_N_would_not_fit_is_an_operator(monkeypatch):
-    monkeypatch.setattr(door, "MOST", 100)
+@pytest.mark.parametrize("most", [100, 10_000])
+def test_a_map_whose_N_would_not_fit_is_an_operator(monkeypatch, most):
+    monkeypatch.setattr(door, "MOST", most)
+    monkeypatch.setattr(door, "BATCH", 6)
     case = Case(3, comm=MPI.COMM_WORLD)
+    g = np.random.default_rng(0).normal(size=case.r.shape)[case.own]
     for masses in ("csr", "KSP"):
         problem = case.problem(G=case.G[case.rows], masses=MASSES[masses](case))
-        assert not problem.has_entries
+        assert problem.has_entries == (most > 100)
         assert problem.diagonal_blocks == pytest.approx(case.blocks)
-        same(case, {"G": case.G[case.rows], "masses": MASSES[masses](case)})
+        assert problem.product(g) == pytest.approx(case.mult(g))
 
 
 def test_masses_of_joints_keep_N_sparse_and_infinite_ones_do_not_move():
@@ -305,6 +308,23 @@ def test_contacts_of_the_plane():
     every = np.concatenate(comm.allgather(g)).ravel()
     expected = (case.N @ every).reshape(-1, 2)[case.own] + case.r[case.own] + g * [0.3, 0.0]
     assert y == pytest.approx(expected)
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("width", [2, 3])
+def test_the_same_matrix_with_other_velocities(width):
+    case = Case(8, comm=MPI.COMM_WORLD, width=width)
+    first = case.problem(G=case.G[case.rows], masses=case.M)
+    before = ccp.solve(first, type="pdip", limits=LIMITS).impulse
+    other = first.with_velocities(0.5 * case.r[case.own])
+    after = ccp.solve(other, type="pdip", limits=LIMITS)
+    assert other.operator is first.operator
+    assert 2.0 * case.mult(after.impulse) == pytest.approx(case.mult(before), abs=1e-4)
+    assert after.velocity == pytest.approx(case.mult(after.impulse) + 0.5 * case.r[case.own])
+    assert ccp.solve(first, type="pdip", limits=LIMITS).impulse == pytest.approx(before)
+    for wrong in (case.r[case.own][1:], np.full_like(case.r[case.own], np.nan), np.zeros((5, 4))):
+        with pytest.raises(ValueError, match="^r "):
+            first.with_velocities(wrong)
 
 
 class Count:

@@ -77,4 +77,6 @@ def test_a_result_is_a_small_table_whose_counts_are_those_of_the_solution(solver
 
 def test_contacts_of_all_ranks_are_counted():
     still = ccp.ConeProblem(SELF, np.array([[-1.0, 0.1, 0], [-1.0, 3.0, 0], [1.0, 0, 0]]), np.ones(3), N=np.eye(9))
-    assert ccp.solve(still).counts == (1, 1, 1)
+    result = ccp.solve(still)
+    assert result.counts == (1, 1, 1)
+    assert result.states.tolist() == [2, 1, 0]
