@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -237,3 +238,153 @@ def test_arm_digs_within_the_torques_of_its_motors():
     shoulder, wrist = importlib.import_module("arm").main(until=0.2)
     assert 0.0 < wrist < 100.0
     assert 0.0 < shoulder <= 1.2 * 400.0
+
+
+# -- cone problems of others ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def half_space():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(EXAMPLES))
+        return importlib.import_module("half_space")
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_the_half_space_has_the_displacements_of_point_forces_far_away(half_space, coupled):
+    """Boussinesq and Cerruti (Johnson, sections 3.2, 3.6), and N is symmetric and positive definite."""
+    n, a, nu = 8, 0.01, half_space.NU
+    K = half_space.influence(n, a, coupled)
+    x, y = -5 * a, 6 * a
+    r, bodies = np.hypot(x, y), 1 if coupled else 2
+    of = bodies / (2 * np.pi * half_space.G)
+    side = of * (0.5 - nu) * coupled / r**2  # a normal force draws its surroundings near
+    expected = [
+        [of * (1 - nu) / r, side * x, side * y],
+        [-side * x, of * ((1 - nu) / r + nu * x**2 / r**3), of * nu * x * y / r**3],
+        [-side * y, of * nu * x * y / r**3, of * ((1 - nu) / r + nu * y**2 / r**3)],
+    ]
+    np.testing.assert_allclose(K[:, :, -5, 6], expected, rtol=5e-3, atol=1e-12 * of / r)
+    given = half_space.operator(n, K)
+    N = np.array([given.mult(row.reshape(-1, 3)).ravel() for row in np.eye(3 * n * n)])
+    np.testing.assert_allclose(N, N.T, atol=1e-14 * abs(N).max())
+    assert np.linalg.eigvalsh(N)[0] > 0.01 * np.linalg.eigvalsh(N)[-1]
+    np.testing.assert_allclose(N[3:6, 3:6], given.blocks[1], atol=1e-14 * abs(N).max())
+
+
+def test_a_smooth_ball_obeys_hertz_and_cattaneo_and_mindlin(half_space):
+    n, theory = 48, half_space.Theory
+    shifts = theory.shift * np.array([0.0, 0.3, 0.8, 1.2])
+    states = half_space.press_and_shift(np.zeros((n, n)), shifts)
+    for shift, state in zip(shifts, states):
+        normal, tangential, across = state.totals
+        assert normal == pytest.approx(theory.normal, rel=2e-3)
+        assert tangential / (half_space.FRICTION * normal) == pytest.approx(theory.tangential(shift), abs=2e-3)
+        assert abs(across) < 1e-6 * normal
+        touching, stuck = (state.zones > 0).sum(), (state.zones == 2).sum()
+        assert touching * (half_space.LENGTH / n) ** 2 == pytest.approx(np.pi * theory.radius**2, rel=0.03)
+        assert np.sqrt(stuck / touching) == pytest.approx(theory.stick(shift), abs=0.03)
+        np.testing.assert_allclose(state.force[::-1, ::-1], state.force, atol=1e-4 * state.force.max())
+        pressure, friction = theory.tractions(half_space.points(n)[:, n // 2, 0], shift)
+        found = state.force[:, n // 2, :2].T * (n / half_space.LENGTH) ** 2
+        inside = pressure > 0.4 * theory.pressure  # at the rim points are partly in contact
+        np.testing.assert_allclose(found[0, inside], pressure[inside], rtol=0.02)
+        np.testing.assert_allclose(found[1, inside], friction[inside], atol=0.02 * theory.pressure)
+
+
+def test_each_point_of_a_rough_ball_obeys_the_law_of_friction(half_space):
+    """What slides has the traction of its limit, against its slip; what sticks has not slid in the step."""
+    n = 48
+    states = half_space.press_and_shift(half_space.roughness(n), half_space.Theory.shift * np.array([0.0, 0.5]), True)
+    for before, state in zip([None, *states], states):
+        slip = state.slip - (0 if before is None else before.slip)
+        limit = half_space.FRICTION * state.force[..., 0]
+        size = np.linalg.norm(state.force[..., 1:], axis=2)
+        assert (size <= limit * (1 + 1e-6)).all()
+        moved = np.linalg.norm(slip, axis=2)
+        assert (state.force[..., 1:] * slip).sum(axis=2).max() <= 1e-4 * (limit * moved).max()
+        far = (state.zones == 1) & (moved > 0.05 * moved[state.zones > 0].max())
+        cosine = (state.force[..., 1:] * slip).sum(axis=2)[far] / (limit * moved)[far]
+        np.testing.assert_allclose(cosine, -1, atol=1e-2)
+        assert moved[state.zones == 2].max() < 1e-3 * moved.max()
+        touching = (state.zones > 0).sum() * (half_space.LENGTH / n) ** 2
+        assert touching < 0.9 * np.pi * half_space.Theory.radius**2
+
+
+def test_a_rough_ball_has_the_pressures_of_tamaas(half_space):
+    """Without friction it is the problem of Polonsky and Keer 1999, whose conjugate gradients tamaas has."""
+    tamaas = pytest.importorskip("tamaas", reason="tamaas is not installed")
+    n, kinds = 48, tamaas.model_type
+    heights = half_space.roughness(n)
+    (state,) = half_space.press_and_shift(heights, np.zeros(1), tol=1e-8)
+    model = tamaas.ModelFactory.createModel(kinds.basic_2d, [half_space.LENGTH] * 2, [n, n])
+    model.E, model.nu = half_space.G / (1 - half_space.NU), 0.0  # of both bodies together
+    tamaas.ModelFactory.registerNonPeriodic(model, "dcfft")
+    ball = heights - (half_space.points(n) ** 2).sum(axis=2) / (2 * half_space.RADIUS)
+    solver = tamaas.PolonskyKeerRey(model, np.ascontiguousarray(ball), 1e-12)
+    solver.setIntegralOperator("dcfft")
+    solver.solve(state.totals[0] / half_space.LENGTH**2)
+    expected = np.asarray(model.traction) * (half_space.LENGTH / n) ** 2
+    np.testing.assert_allclose(state.force[..., 0], expected, atol=1e-6 * expected.max())
+
+
+@pytest.fixture(scope="module")
+def block():
+    pytest.importorskip("skfem", reason="scikit-fem is not installed (extra `examples`)")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(EXAMPLES))
+        return importlib.import_module("block")
+
+
+def test_a_block_without_friction_has_uniform_pressure(block):
+    """Held by planes of symmetry and a smooth top it has the stress of a bar, and widens by Poisson's ratio."""
+    bar = block.Block(3, friction=0.0)
+    x = bar.mesh.p
+    bar.held = np.array([x[0] == 0, x[1] == 0, x[2] == block.SIZE[2]])
+    (state,) = bar.move(np.array([[0.0, 0.0, -0.3]]))
+    strain = 0.3 / block.SIZE[2]
+    np.testing.assert_allclose(state.force[:, 0], block.YOUNG * strain * bar.area, rtol=1e-6)
+    np.testing.assert_allclose(state.u, np.array([[block.NU], [block.NU], [-1]]) * strain * x, atol=1e-8)
+    np.testing.assert_allclose(bar.stress(state.u), block.YOUNG * strain, rtol=1e-6)
+
+
+def test_a_block_sticks_then_slides_with_the_force_of_its_friction(block, capsys):
+    states = block.main(3)
+    shape = block.Block(3)
+    x, y = shape.mesh.p[:2, shape.floor]
+    mirror = np.lexsort([x, block.SIZE[1] - y])
+    for before, state in zip([None, *states], states):
+        force, u = state.force, state.u[:, shape.floor]
+        np.testing.assert_allclose(state.held + force.sum(axis=0)[[1, 2, 0]], 0, atol=1e-9 * force.sum())
+        np.testing.assert_allclose(force[mirror] * [1, 1, -1], force, atol=1e-5 * force.max())  # the plane y = 10 mm
+        assert u[2].min() > -1e-7
+        assert (np.minimum(force[:, 0], 0) == 0).all()
+        assert (force[:, 0] * u[2]).sum() < 1e-7 * force[:, 0].sum()
+        slip = (u if before is None else u - before.u[:, shape.floor])[:2].T
+        limit, size = block.FRICTION * force[:, 0], np.linalg.norm(force[:, 1:], axis=1)
+        assert (size <= limit * (1 + 1e-9)).all()
+        work = (force[:, 1:] * slip).sum()  # the greatest that friction can take
+        assert work == pytest.approx(-(limit * np.linalg.norm(slip, axis=1)).sum(), rel=1e-6, abs=1e-7 * force.max())
+    sticking = [state.result.counts.sticking for state in states[1:]]
+    assert sticking == sorted(sticking, reverse=True)
+    assert sticking[0] > sticking[-1] == 0  # the part that sticks shrinks
+    shear, normal = -states[-1].force[:, 1].sum(), states[-1].force[:, 0].sum()
+    assert shear == pytest.approx(block.FRICTION * normal, rel=0.01)
+    assert "shear / normal" in capsys.readouterr().out
+
+
+def test_the_block_says_what_it_needs():
+    hidden = "import sys; sys.modules['skfem'] = None; sys.path.insert(0, sys.argv[1]); import block"
+    done = subprocess.run([sys.executable, "-c", hidden, str(EXAMPLES)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == "block.py needs scikit-fem: pip install 'pctt[examples]', or scikit-fem itself\n"
+
+
+@pytest.mark.parametrize(("name", "n"), [("half_space", 36), ("block", 3)])
+def test_pictures_of_cone_problems(name, n, tmp_path):
+    matplotlib = pytest.importorskip("matplotlib", reason="matplotlib is not installed (extra `figures`)")
+    if name == "block":
+        pytest.importorskip("skfem", reason="scikit-fem is not installed (extra `examples`)")
+    matplotlib.use("agg")
+    importlib.import_module(name).main(n, str(tmp_path / "picture.png"))
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
