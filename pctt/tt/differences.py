@@ -28,13 +28,14 @@ from math import inf, prod
 import numpy as np
 from scipy import fft
 
-from pctt.tt.conjugate import PATIENCE, ConjugateGradients, Promise, iterations, race
+from pctt.tt.conjugate import DIGITS, PATIENCE, ConjugateGradients, Promise, iterations, race
 from pctt.tt.train import Array
 
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
 POINTS = 4096  # most points of a part of the grid, on which solutions are tried; with 1024 two of 26 choices were bad
 SLACK = 1.5  # a preconditioner that costs so many times more than another one on a part is not tried further
 MOST = 400.0  # products that a trial may cost
+FINAL = 1.5  # digits that a trial on the whole grid gains, where parts of it need no preconditioner
 
 #: What is tried: the transforms of which the mean of the inverses is taken, and their shares.
 Kind = tuple[tuple[str, float], ...]
@@ -320,7 +321,7 @@ def choose(a: Differences) -> Choice | None:
 
     Parts of the grid are principal submatrices of A: neighbouring points show how a behaves near zero, points that are
     spread over the grid how it does far from it. If no preconditioner is good on both, those that win on one of them
-    have a trial on the whole grid.
+    have a trial on the whole grid; a short one, with the best of them, if both parts need none.
     """
     if all(a.periodic):  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
@@ -334,40 +335,49 @@ def choose(a: Differences) -> Choice | None:
         if trial is None:
             return None
         trials.append(trial)
-    totals = {kind: prod(trial.costs[kind] for trial in trials) for kind in kinds}
+    totals = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}  # the harder part counts
     found = min(kinds, key=lambda kind: totals[kind])
+    finalists: list[Kind] = []
     if totals[found] == inf:
-        whole = _trial(a, list(dict.fromkeys(trial.winner for trial in trials)))
+        finalists = list(dict.fromkeys(trial.winner for trial in trials))
+    elif found == NOTHING and len(trials) > 1:  # parts of I + h^d K are nearer to I than the whole
+        finalists = [NOTHING, min(set(kinds) - {NOTHING}, key=lambda kind: (totals[kind], kinds.index(kind)))]
+    if finalists:
+        whole = _trial(a, finalists, DIGITS if totals[found] == inf else FINAL)
         if whole is None:
             return None
         found = whole.winner
-    worst = max(trials, key=lambda trial: iterations(trial.runs[found].norms))
-    alone = max((trial.runs[NOTHING].norms for trial in trials), key=iterations)
-    return Choice(found, Promise(worst.runs[found].each, worst.runs[found].norms, alone))
+        trials = [*trials, whole]
+    norms, alone = (
+        max((trial.runs[kind].norms for trial in trials if kind in trial.runs), key=iterations)
+        for kind in (found, NOTHING)
+    )
+    return Choice(found, Promise(trials[-1].runs[found].each, norms, alone))
 
 
 class _Trial:
     """Solutions with a matrix by conjugate gradients with preconditioners, with a random right side."""
 
-    def __init__(self, a: Differences, inverses: dict[Kind, FastInverse]) -> None:
+    def __init__(self, a: Differences, inverses: dict[Kind, FastInverse], digits: float) -> None:
         times = a.times
         b = np.random.default_rng(0).standard_normal(prod(a.shape) * a.block)
         solves = {kind: inverse.solve if kind else None for kind, inverse in inverses.items()}
         self.runs = {kind: ConjugateGradients(times, b, solves[kind], inverses[kind].each) for kind in inverses}
-        costs = race(list(self.runs.values()), SLACK, MOST)
+        costs = race(list(self.runs.values()), SLACK, MOST, digits)
         self.costs = dict(zip(self.runs, costs))
         self.winner = min(self.costs, key=lambda kind: self.costs[kind])
-        alone, enough = self.runs.get(NOTHING), 1e-8 * float(np.linalg.norm(b))
-        while alone and not alone.failed and alone.norms[-1] > enough and alone.cost < PATIENCE * min(costs):
+        alone, enough = self.runs.get(NOTHING), 10.0**-digits * float(np.linalg.norm(b))
+        most = PATIENCE * min(costs) if digits == DIGITS else 0.0
+        while alone and not alone.failed and alone.norms[-1] > enough and alone.cost < most:
             alone.step()
 
 
-def _trial(a: Differences, kinds: Sequence[Kind]) -> _Trial | None:
+def _trial(a: Differences, kinds: Sequence[Kind], digits: float = DIGITS) -> _Trial | None:
     """None if A is not positive definite."""
     inverses = {kind: FastInverse(a, kind) for kind in kinds}
     if not all(inverse.positive for inverse in inverses.values()):
         return None
-    trial = _Trial(a, inverses)
+    trial = _Trial(a, inverses, digits)
     return None if all(run.failed for run in trial.runs.values()) else trial
 
 

@@ -58,7 +58,8 @@ def test_minus_a_kernel(rank, kind):
             ksp = ready(mat, rank=rank)
             its[name], residual = solve(ksp)
             assert residual < 1e-6
-    assert its["minus"] == its["plus"] < 15
+    assert its["minus"] == pytest.approx(its["plus"], abs=3)  # starts of trains are random
+    assert its["plus"] < 15
 
 
 @pytest.mark.parallel(1, 2)

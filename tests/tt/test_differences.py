@@ -129,6 +129,17 @@ def test_the_choice_is_no_worse_than_nothing_and_a_circulant(name, points, monke
         assert count(a, kind) <= 0.4 * count(a, of.CIRCULANT)
 
 
+@pytest.mark.parametrize("strength", [1000.0, 2500.0])
+def test_parts_of_an_equation_of_the_second_kind_do_not_show_all_of_it(strength) -> None:
+    """Of I + h^3 K: a part of few points is near I, and conjugate gradients alone would seem good enough."""
+    n = 60
+    r = np.sqrt((offsets(n, n, n) ** 2).sum(axis=0)) / n
+    near = np.where(r > 0, 1 / np.maximum(r, 1 / n), 2.38 * n)
+    a = kernel(strength / (4 * np.pi) / n**3 * np.exp(-10 * r) * near, 1.0)
+    kind = of.choose(a).kind
+    assert count(a, kind) <= 1.3 * min(count(a, of.NOTHING), count(a, of.CIRCULANT))
+
+
 def test_the_best_share_is_chosen() -> None:
     t = 2 - 2 * np.cos(2 * np.pi * np.arange(512) / 512)
     fractional = np.fft.irfft2((t[:, None] + t[:257]) ** 0.7)[:48, :48]

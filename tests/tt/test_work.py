@@ -35,7 +35,7 @@ def test_a_limit_ends_compression_and_inversion_at_the_same_place() -> None:
         with pytest.raises(TooMuchWorkError, match=phase):
             both(work)
         assert work.spent < 2 * whole
-    work = Work(compression + 0.25 * inversion)  # the result of the last whole sweep
+    work = Work(compression + 0.12 * inversion)  # the result of the last whole sweep
     found = both(work)
     assert "the inversion, at rank" in found.stopped
     assert 1e-6 < found.residual < 0.5
