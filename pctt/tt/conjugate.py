@@ -12,7 +12,7 @@ from pctt.tt.train import Array
 
 Product = Callable[[Array], Array]
 DIGITS = 8.0  # of the residual, that a solution gains
-AT_LEAST = 12.0  # products of a solution that are too few to be watched
+AT_LEAST = 24.0  # products of a solution that are too few to be watched
 PATIENCE = 3.0  # what a preconditioner may cost, in costs that its trial has shown
 
 

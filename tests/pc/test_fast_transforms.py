@@ -12,7 +12,7 @@ from train_solver import context, dense_of, operator, ready, report, shell, solv
 
 from pctt.mat import from_differences
 from pctt.tt import differences as of
-from pctt.tt.conjugate import Promise
+from pctt.tt.conjugate import AT_LEAST, Promise
 
 GRID = (10, 7)
 SIZE = 70
@@ -149,7 +149,7 @@ def test_a_preconditioner_that_breaks_its_promise_is_left(method, norm, guess, m
     ksp.solve(b, x)
     assert ksp.getConvergedReason() > 0
     assert ksp.max_it == 2000
-    assert ksp.getIterationNumber() <= 16
+    assert ksp.getIterationNumber() <= AT_LEAST  # CG alone takes five
     r = b.duplicate()
     A.mult(x, r)
     r.aypx(-1.0, b)
