@@ -62,30 +62,37 @@ class Loop:
     @cached_property
     def compiled(self) -> Callable[..., Any]:
         """What numba makes of the function, on one thread."""
-        return self._compiled(self._function, self._options)
+        self.compiled = self._dispatcher(self._function, self._options)  # first, as a loop that it reaches may reach it
+        return self._with_all_reached(self.compiled)
 
     @cached_property
     def _on_threads(self) -> Callable[..., Any]:
         f = self._function
         other = FunctionType(f.__code__, f.__globals__, f.__name__, f.__defaults__, f.__closure__)
         other.__module__, other.__qualname__ = f.__module__, f.__qualname__ + "_on_threads"  # a file of its own on disk
-        return self._compiled(other, {**self._options, "parallel": True})
+        return self._with_all_reached(self._dispatcher(other, {**self._options, "parallel": True}))
 
-    def _compiled(self, function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
+    def _dispatcher(self, function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:
         import numba
 
-        from dem.machine_code import MachineCode
-
-        names = self._function.__globals__
         if self._spreads:
-            names["prange"] = numba.prange
-        for name in self._function.__code__.co_names:  # the compiler knows no loop that it has not made
-            if isinstance(names.get(name), Loop):
-                names[name] = names[name].compiled
-        compiled = numba.njit(**options)(function)
-        if compiled is not function:  # as NUMBA_DISABLE_JIT leaves it
+            function.__globals__["prange"] = numba.prange
+        return cast(Callable[..., Any], numba.njit(**options)(function))
+
+    def _with_all_reached(self, compiled: Any) -> Any:
+        """The same; the compiler knows no loop that it has not made, nor what is compiled anew if it changes."""
+        from dem.machine_code import MachineCode, global_names
+
+        function = self._function
+        for space, name in global_names(function):
+            if isinstance(space[name], Loop):
+                space[name] = space[name].compiled
+        for cell in function.__closure__ or ():
+            if isinstance(cell.cell_contents, Loop):
+                cell.cell_contents = cell.cell_contents.compiled
+        if hasattr(compiled, "py_func"):  # not with NUMBA_DISABLE_JIT
             with suppress(RuntimeError):  # no file of its own: typed at a prompt
-                compiled._cache = MachineCode(function)
+                compiled._cache = MachineCode(compiled)
         return compiled
 
 
@@ -94,8 +101,7 @@ def loop(function: Function) -> Function:
 
     So its bits are the same on all processors and after each compilation. Were products and sums fused, they would
     not be: which product is fused with a sum depends on the order in which numba visits the variables, and that changes
-    from process to process. (What numba calls fast also assumes that there are no NaNs.) numba compiles again only when
-    the file of ``function`` itself changes: a loop must not call a loop of another file."""
+    from process to process. (What numba calls fast also assumes that there are no NaNs.)"""
     return cast(Function, Loop(function, {}))
 
 

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import importlib
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
 from cases import random_quaternions
 from numba.core.caching import CompileResultCacheImpl
 
+import dem
 from dem import quaternion
 from dem.arrays import places
 from dem.bodies import SPHERE
@@ -110,6 +116,82 @@ def test_damaged_machine_code_is_made_anew(tmp_path, monkeypatch):
         with pytest.warns(UserWarning, match="is damaged .* and made anew"):
             assert importlib.reload(module).twice(1.5) == 3.0
         assert importlib.reload(module).twice(1.5) == 3.0
+
+
+def test_machine_code_is_that_of_all_that_a_loop_reaches(tmp_path, monkeypatch):
+    """After changes of other files, which keep their lengths and their times: functions by name and by attribute, of a
+    closure and of another function, constants, and the order of fields."""
+    sources = {
+        "__init__": "",
+        "deep": """
+            from dem.compiled import inlined
+            SIZE = 5.0
+            @inlined
+            def times(x): return 2.0 * x""",
+        "vectors": """
+            from collections import namedtuple
+            import numpy as np
+            from dem.compiled import inlined
+            from small import deep
+            FACTOR, TABLE = 3.0, np.array([0.0, 4.0])
+            Pair = namedtuple("Pair", ["first", "other"])
+            @inlined
+            def one(x): return 1.0
+            @inlined
+            def twice(x): return deep.times(x)""",
+        "loops": """
+            from dem.compiled import loop
+            from small import vectors
+            from small.vectors import FACTOR, Pair, twice
+            def shifted_by(shift):
+                @loop
+                def shifted(x): return twice(x) + shift(x)
+                return shifted
+            shifted = shifted_by(vectors.one)
+            @loop
+            def tuples(x): return twice(x), vectors.twice(x), FACTOR * x, vectors.TABLE[1] * x, vectors.deep.SIZE * x
+            @loop
+            def leading(pair): return pair.first
+            def ask(): return [*tuples(1.0), shifted(1.0), leading(Pair(1.0, 2.0))]
+            def compiled():
+                return sum(sum(f.compiled.stats.cache_misses.values()) for f in (tuples, shifted, leading))""",
+    }
+    package = tmp_path / "small"
+    package.mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("sys.dont_write_bytecode", True)  # Python's own files are found by length and time
+
+    def write(name, text):
+        (package / f"{name}.py").write_text(textwrap.dedent(text))
+        os.utime(package / f"{name}.py", (1e9, 1e9))
+
+    def ask():
+        for name in [name for name in sys.modules if name.split(".")[0] == "small"]:
+            del sys.modules[name]
+        loops = importlib.import_module("small.loops")
+        return loops.ask(), loops.compiled()
+
+    for name, text in sources.items():
+        write(name, text)
+    assert ask() == ([2, 2, 3, 4, 5, 3, 1], 3)
+    assert ask() == ([2, 2, 3, 4, 5, 3, 1], 0)
+    for name, old, new, answers, compiled in [
+        ("deep", "2.0 * x", "7.0 * x", [7, 7, 3, 4, 5, 8, 1], 2),
+        ("deep", "SIZE = 5.0", "SIZE = 6.0", [2, 2, 3, 4, 6, 3, 1], 1),
+        ("vectors", "= 3.0", "= 9.0", [2, 2, 9, 4, 5, 3, 1], 1),
+        ("vectors", "4.0]", "8.0]", [2, 2, 3, 8, 5, 3, 1], 1),
+        ("vectors", "return 1.0", "return 6.0", [2, 2, 3, 4, 5, 8, 1], 1),
+        ("vectors", '["first", "other"]', '["other", "first"]', [2, 2, 3, 4, 5, 3, 2], 1),
+    ]:
+        assert old in sources[name]
+        write(name, sources[name].replace(old, new))
+        assert ask() == (answers, compiled), f"{old} -> {new}"
+        write(name, sources[name])
+    code = "from small import loops; print(loops.ask(), loops.compiled())"
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{Path(dem.__file__).parents[1]}", "PYTHONHASHSEED": "7"}
+    process = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert process.stdout.split("]")[1].strip() == "0"  # another process finds the same, and that of the first sources
+    assert ask() == ([2, 2, 3, 4, 5, 3, 1], 0)
 
 
 def test_machine_code_that_was_installed_is_read_where_nobody_can_write(tmp_path, monkeypatch):
