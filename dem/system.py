@@ -155,6 +155,8 @@ class ContactSystem:
         self.surface = surface_velocities(world, contacts, self.frame)
         if self.surface is not None:
             self.b[:, 1:] = self.surface
+        if contacts.swing is not None:
+            self.b[:, 1:] += np.einsum("cij,cj->ci", self.frame[:, 1:], contacts.swing)
         self.take_flow(world, contacts)
         self.cell = cell_of(world, contacts, self.frame, dt)
         if self.cell is not None:

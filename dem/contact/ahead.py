@@ -8,8 +8,17 @@ a step early, and bears load for as long as it should.
 
 The end is foreseen with the velocities before the step. Gaps are linear in the velocities about the places foreseen, so
 where velocities do not change no overlap is left at the end. The price: the energy of a body that slides freely along a
-curve, and angular momentum about a contact, are kept to first order in the step only. What balances forces does not
-depend on that. docs/mechanics.md has what directions of the start of lasting contacts alone would do.
+curve is kept to first order in the step only. What balances forces does not depend on that. docs/mechanics.md has what
+directions of the start of lasting contacts alone would do.
+
+Arms are another matter. The impulse J of a step acts at its start, between two velocities. Its work is that of J on
+their mean at the end of the arm, whatever arm it has. With the arm r of the start, a point that rests has the velocity
+-dt/2 w x (w x r) by the later spin w, and +dt/2 w x (w x r) by the one before: no work, to second order. With that of
+the end (or of the middle) both have the same sign, and each step brakes a body that spins on a corner. So bodies have
+the arms of the start, both to one place: angular momentum is kept. What the arms then miss of the way that surfaces go
+along each other in the step, the term with dt/2, is foreseen and added (`Contacts.swing`): a body that turns together
+with another one does not creep on it. Bodies of prescribed motion have the arms of the end, as normals: a tool does the
+work that its force does at the speed of its face.
 
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
@@ -43,6 +52,7 @@ class Course(NamedTuple):
 
     place: Floats  #: (rows, 3) [m]
     velocity: Floats  #: (rows, 6) [m/s, rad/s]
+    moves: Bools  #: (rows,) which of them impulses move
     dt: float  #: [s]
 
 
@@ -55,7 +65,7 @@ def hosts_first(one: Ints, two: Ints) -> Bools:
 @loop
 def seen_from(
     kind: Ints, row: Ints, center: Floats, quaternion: Floats, size: Floats, radius: Floats, inner: Floats,
-    place: Floats, velocity: Floats, dt: float, i: Ints, j: Ints,
+    place: Floats, velocity: Floats, moves: Bools, dt: float, i: Ints, j: Ints,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Centres (m, 3) and quaternions (m, 4) of guests, the rows i (m,) of `Primitives`, at the end of a step, as seen
     from the bodies of their hosts, the rows j (m,), put back to where these are now; and how far the surfaces of the
@@ -80,18 +90,21 @@ def seen_from(
 @loop
 def turn_ahead(
     kind: Ints, row: Ints, center: Floats, quaternion: Floats, size: Floats, radius: Floats, inner: Floats,
-    place: Floats, velocity: Floats, dt: float, i: Ints, j: Ints, pair: Ints, point: Floats, normal: Floats,
-    gap: Floats,
-) -> tuple[Floats, Floats, Ints]:  # fmt: skip
-    """Give contacts (nc,) of the pairs of rows i, j (m,) of `Primitives` the normals of the end of a step of dt [s]:
-    `point` is then as seen from the present place of body i. Returns (nc, 3) from body j to where it is relative to i
-    then, and the gaps (nc,) from which gaps that are linear in the velocities lead to those of the end [m]. Contacts
-    of guests in the places of `seen_from` get these as their `gap`; returns also which of them overlap by
-    more than DEEP so.
+    place: Floats, velocity: Floats, moves: Bools, dt: float, i: Ints, j: Ints, pair: Ints, point: Floats,
+    normal: Floats, gap: Floats,
+) -> tuple[Floats, Floats, Floats, Ints]:  # fmt: skip
+    """Give contacts (nc,) of the pairs of rows i, j (m,) of `Primitives` the normals of the end of a step of dt [s] and
+    the places of its start, of bodies of prescribed motion those of its end: `point` is as seen from the present place
+    of body i. Returns (nc, 3) from body j to where it is relative to i for that [m]; by how much (nc, 3) the mean
+    velocities of surfaces along each other, of j relative to i, differ from those with these arms [m/s]; and the gaps
+    (nc,) from which gaps that are linear in the velocities lead to those of the end [m]. Contacts of guests in the
+    places of `seen_from` get these as their `gap`; returns also which of them overlap by more than DEEP so.
 
-    The bodies in the rows of `Primitives.row` are at `place` (rows, 3) and move with `velocity` (rows, 6).
+    The bodies in the rows of `Primitives.row` are at `place` (rows, 3) and move with `velocity` (rows, 6); those that
+    impulses move are in `moves` (rows,).
     """
-    moved, linear, deep, found = np.zeros((len(pair), 3)), gap.copy(), np.empty(len(pair), np.int64), 0
+    moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
+    deep, found = np.empty(len(pair), np.int64), 0
     for c in range(len(pair)):
         one, two = i[pair[c]], j[pair[c]]
         swap = RANK[min(kind[one], CLUMP)] > RANK[min(kind[two], CLUMP)]
@@ -100,27 +113,45 @@ def turn_ahead(
         V, W, u, w = _vector(velocity[A], 0), _vector(velocity[B], 0), _vector(velocity[A], 3), _vector(velocity[B], 3)
         h, _ = _ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
         here = kind[a] == SPHERE and kind[b] in (SPHERE, PLANE, BOX)
+        core = size[a, 0] if kind[a] in (SPHERE, CAPSULE) else 0.0  # its surface turns with the normal, not with a body
+        under = size[b, 0] if kind[b] in (SPHERE, CAPSULE) else 0.0
+        apart = plus(place[A], -1.0, place[B])
         if here:
             lever, other = plus(center[a], -1.0, place[A]), plus(center[b], -1.0, place[B])
             ahead, beside = _after(lever, u, h), _after(other, w, h)
             end = plus(plus(plus(plus(center[a], -1.0, center[b]), h, V), -h, W), -1.0, beside)
             end = plus(plus(end, 1.0, plus(ahead, -1.0, lever)), 1.0, other)
-            n, after = _from_host(end, kind[b], quaternion[b], size[b], size[a, 0], w, h)
-            half = 0.5 * min(gap[c], 0.0)
-            own = plus(lever, size[a, 0] + half, n)  # forces act at the start: those of a top at the end brake it
-            base = other if kind[b] == SPHERE else beside
-            their = plus(plus(base, 1.0, end), size[a, 0] + after - half, n)
+            n, after = _from_host(end, kind[b], quaternion[b], size[b], core, w, h)
+            their = plus(plus(other if kind[b] == SPHERE else beside, 1.0, end), core + after, n)
+            own, inside = plus(lever, core, n), lever
         else:
             n = _after((sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]), w, h)
-            their = _after(plus(point[c], -1.0, place[B]), w, h)
-            own = plus(plus(plus(their, 1.0, place[B]), -1.0, place[A]), h, plus(W, -1.0, V))
-            after = gap[c]
+            middle, after = _after(plus(point[c], -1.0, place[B]), w, h), gap[c]
+            own = plus(plus(plus(middle, -0.5 * after, n), -1.0, apart), h, plus(W, -1.0, V))
+            their = plus(middle, 0.5 * after, n)
+            inside = _after(plus(own, -core, n), u, -h)
         if h == 0.0 or dot(n, n) == 0.0:
             continue
+        below = _after(plus(their, under, n), w, -h)
+        if kind[b] == SPHERE:
+            below = plus(center[b], -1.0, place[B])
+        if moves[A]:
+            own = plus(inside, core, n)
+            if under == 0.0:
+                below = plus(own, 1.0, apart)  # the two arms lead to one place
+        if moves[B] and kind[b] != SPHERE:
+            their = plus(below, -under, n)
         linear[c] = after - h * dot(n, plus(plus(W, 1.0, cross(w, their)), -1.0, plus(V, 1.0, cross(u, own))))
-        if not here:
-            half = 0.5 * (after - min(linear[c], 0.0))
-            own, their = plus(own, -half, n), plus(their, half, n)
+        half = 0.5 * min(gap[c] if here else linear[c], 0.0)
+        if moves[A] and under == 0.0:
+            below = plus(below, linear[c], n)
+            their = below if moves[B] else their
+        more = plus(_bend(below, w, dt), -1.0, _bend(inside, u, dt))
+        if kind[b] != SPHERE:
+            more = plus(more, 1.0, cross(w, plus(plus(below, -under, n), -1.0, their)))
+        more = plus(more, -1.0, cross(u, plus(plus(inside, core, n), -1.0, own)))
+        more = plus(more, -dot(more, n), n)
+        own, their = plus(own, half, n), plus(their, -half, n)
         if not here:
             gap[c], deep[found] = linear[c], c
             found += linear[c] < -DEEP * _thickness(kind[a], size[a], inner)
@@ -130,7 +161,8 @@ def turn_ahead(
             normal[c, k] = sign * n[k]
             point[c, k] = at[k] + first[k]
             moved[c, k] = point[c, k] - second[k] - to[k]
-    return moved, linear, deep[:found]
+            swing[c, k] = sign * more[k]
+    return moved, swing, linear, deep[:found]
 
 
 @inlined
@@ -213,6 +245,17 @@ def _after(v, spin, time):
     rotation = time * spin[0], time * spin[1], time * spin[2]
     sine, versed = shares(rotation)
     return turned(v, rotation, sine, versed)
+
+
+_ZERO = (0.0, 0.0, 0.0)
+
+
+@inlined
+def _bend(arm, spin, dt):
+    """By how much the mean velocity of the end of an arm that turns for dt differs from that at the start."""
+    if dot(spin, spin) == 0.0 or dot(arm, arm) == 0.0:
+        return 0.0, 0.0, 0.0
+    return plus(plus(_ZERO, 1.0 / dt, plus(_after(arm, spin, dt), -1.0, arm)), -1.0, cross(spin, arm))
 
 
 @inlined

@@ -208,11 +208,11 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
 
 def touches_ahead(
     table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course
-) -> tuple[Manifold, Floats, Floats]:
+) -> tuple[Manifold, Floats, Floats, Floats]:
     """The contacts as `turn_ahead` gives them directions of the end of a step, and what this returns of them. A deep
     gap is no deeper than the pair overlaps at the start, and none is wider than `delta` there."""
     found = touches(table, i, j, delta, course)
-    moved, linear, deep = turn_ahead(*table.columns(), *course, i, j, found.pair, *found.touch)
+    moved, swing, linear, deep = turn_ahead(*table.columns(), *course, i, j, found.pair, *found.touch)
     if len(deep):
         pairs, row = np.unique(found.pair[deep], return_inverse=True)
         now, least = touches(table, i[pairs], j[pairs], delta[pairs]), delta[pairs]
@@ -220,8 +220,8 @@ def touches_ahead(
         found.touch.gap[deep] = np.maximum(linear[deep], least[row])
     if (wide := found.touch.gap > delta[found.pair]).any():
         found = Manifold(found.pair[~wide], found.feature[~wide], found.touch.take(~wide))
-        moved, linear = moved[~wide], linear[~wide]
-    return found, moved, linear
+        moved, swing, linear = moved[~wide], swing[~wide], linear[~wide]
+    return found, moved, swing, linear
 
 
 def _touching(

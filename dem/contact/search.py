@@ -47,6 +47,9 @@ class Contacts:
     #: step; None: nowhere [m]
     moved: Floats | None = None
     linear: Floats | None = None  #: (nc,) the gaps from which gaps linear in the velocities start; None: `gap` [m]
+    #: (nc, 3) by how much the mean velocities along the surfaces in the step, of b relative to a, differ from those with
+    #: these arms, as bodies turn; None: nothing [m/s]
+    swing: Floats | None = None
     drift: Floats | None = None  #: (nc, 3) what the shear adds to the velocity of b relative to a; None: nothing [m/s]
     #: (nc,) the normal velocities after impacts that `dem.impacts` follows; -inf where two do not meet, NaN where
     #: nothing is followed; None: nowhere [m/s]
@@ -62,7 +65,7 @@ class Contacts:
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row per contact by name, without copies."""
         left = {"near", "shifts", "lag", "held_overlap"}
-        left |= {name for name in ("moved", "linear", "drift", "parting") if getattr(self, name) is None}
+        left |= {name for name in ("moved", "linear", "swing", "drift", "parting") if getattr(self, name) is None}
         return {name: value for name, value in vars(self).items() if name not in left}
 
     @property
@@ -124,17 +127,19 @@ def find_contacts(
     i, j, reach = meeting(world, near, lists, table, delta, shifts, grown)
     table, i, j, reach = table.of_members(i, j, reach)
     moved: Floats | None = None
+    swing: Floats | None = None
     linear: Floats | None = None
     if dt:
-        course = Course(near.bodies.position, _motions(world, near, pictures, dt), dt)
-        (pair, feature, touch), moved, linear = touches_ahead(table, i, j, reach, course)
+        motions = _motions(world, near, pictures, dt)
+        course = Course(near.bodies.position, motions, bodies.is_dynamic(near.bodies), dt)
+        (pair, feature, touch), moved, swing, linear = touches_ahead(table, i, j, reach, course)
     else:
         pair, feature, touch = touches(table, i, j, reach)
     key, a, b, body, friction, weight = named(
         *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
         *(table.hulls.features, near.grains, i, j, pair, feature),
     )
-    contacts = Contacts(key, a, b, body, *touch, friction, near, shifts, moved, linear)
+    contacts = Contacts(key, a, b, body, *touch, friction, near, shifts, moved, linear, swing)
     if pictures is not None:
         contacts, weight = _without_images(world, contacts, base, pictures)
     back = np.flatnonzero(pair[1:] <= pair[:-1])  # other shapes come behind the spheres, and touch in several points
