@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows
-from dem.exchange import refuse
+from dem.exchange import on_each, refuse
 from pctt.ccp.accuracy import Accuracy, figures, measure
 from pctt.ccp.cone import Array, tangential
 from pctt.ccp.coulomb import fixed_point
@@ -29,7 +29,7 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.registry import MATRIX, NEWTON, SOLVERS, why_no_form, why_refused
 from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Counts, Limits, Result, Status
 from pctt.ccp.rolling import RollingProblem
-from pctt.ccp.unbounded import why_unanswered, why_unbounded
+from pctt.ccp.unbounded import why_indefinite, why_unanswered, why_unbounded
 from pctt.log import phase
 
 __all__ = [
@@ -98,7 +98,8 @@ def solve(
         raise ValueError(f"the solver {type!r} reads rows of N, but N is given by its products; allowed are {allowed}")
     limits = limits or Limits()
     if monitor is not None or limits.monitor:
-        limits = dataclasses.replace(limits, watch=monitor or partial(_print, problem.comm))
+        watch = monitor or partial(_print, problem.comm)
+        limits = dataclasses.replace(limits, watch=lambda *at: on_each(problem.comm, "monitor", lambda: watch(*at)))
     if not limits.tol > 0.0:
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
     result = asked = _by(type, problem, _start(problem, guess), limits, options, newton, law)
@@ -161,6 +162,8 @@ def _by(
         result.impulse, result.status, result.residual = nothing, Status.BREAKDOWN, cold
     elif unbounded := why_unbounded(problem, result.impulse):
         result.status, result.reason = Status.UNBOUNDED, unbounded
+    elif result.converged and (indefinite := why_indefinite(problem)):
+        result.status, result.reason, result.exhausted = Status.BREAKDOWN, indefinite, True
     accuracy = _measure(problem, result)
     if result.converged and (squeezed := limits.squeezed(accuracy, coulomb)):
         result.status, result.reason = Status.SQUEEZED, squeezed
@@ -198,8 +201,13 @@ def _start(problem: ConeProblem, guess: Array | None) -> Array:
     """The guess in the cones (nc, 3), zero without one; ValueError on all ranks for another shape or if it is no
     number."""
     none = np.zeros_like(problem.r)
-    start = problem.shown(none) if guess is None else np.ascontiguousarray(guess, dtype=float)
-    wrong = "" if np.isfinite(start).all() else "a guess with a NaN or an infinite number"
+    start, wrong = problem.shown(none), ""
+    try:
+        start = start if guess is None else np.ascontiguousarray(guess, dtype=float)
+    except (TypeError, ValueError) as error:
+        wrong = f"a guess of no numbers: {error}"
+    if not np.isfinite(start).all():
+        wrong = "a guess with a NaN or an infinite number"
     if start.shape != problem.shown(none).shape:
         wrong = f"a guess of shape {start.shape}; allowed is {problem.shown(none).shape}"
     refuse(problem.comm, wrong)

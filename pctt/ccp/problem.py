@@ -14,8 +14,8 @@ from dem.compiled import loop
 from dem.contact_map import BlockRows
 from dem.exchange import reduced, refuse
 from pctt.ccp import door
-from pctt.ccp.cone import Array, FrictionCones
-from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, without_hubs
+from pctt.ccp.cone import TINY, Array, FrictionCones
+from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, ritz_values, without_hubs
 
 
 class Errors(NamedTuple):
@@ -86,11 +86,9 @@ class ConeProblem:
         key: np.ndarray | None = None,
         compliance: Array | float = 0.0,
     ):
-        if (G is None) == (N is None):
-            raise ValueError("a cone problem is given by either the map G or the matrix N")
         self.comm, self.point, self.key = comm, point, key
-        rest = {"G": G, "masses": masses, "point": point, "key": key, "compliance": compliance}
-        contacts = door.contacts_of(comm, r, mu, **rest)
+        data = {"N": N, "G": G, "masses": masses, "point": point, "key": key, "compliance": compliance}
+        contacts = door.contacts_of(comm, r, mu, **data)
         self.units, self._width = contacts.units, contacts.width
         self.r, self.mu, self._given_r = contacts.r, contacts.mu, contacts.given_r
         self.compliance = compliances(compliance, len(self.r))
@@ -250,6 +248,18 @@ class ConeProblem:
         """Arrays of this rank that are equal where contacts, their bodies and all sizes are."""
         key = np.zeros(0) if self.key is None else self.key
         return (key, *self.operator.structure(), np.array([self.size]))
+
+    @cached_property
+    def lowest_curvature(self) -> float:
+        """The least d'Nd / d'd that some Lanczos steps find for impulses d, over the greatest; 0 where N is positive
+        semidefinite by its making. Rounded digits of N make it negative too: -1e-5 with five. Collective."""
+        if self.contact_map is not None:
+            return 0.0
+        free = np.ones_like(self.r)
+        free[self.mu == 0.0, 1:] = 0.0  # what has no friction has no tangential impulses
+        start = free * np.random.default_rng(self.comm.rank).standard_normal(self.r.shape)
+        values = ritz_values(lambda d: free * self.product(d), start, self.sum)
+        return min(values[0] / max(abs(values[0]), abs(values[-1]), TINY), 0.0)
 
     @cached_property
     def all_yield(self) -> bool:

@@ -154,7 +154,7 @@ class Result:
     counts : the open, sliding and sticking contacts of all ranks
     beyond : iterations among them after the limits were met, towards the aim beyond these
     asked : what the asked method made of it, where another one had to follow; else None
-    exhausted : whether it has tried the other methods, too
+    exhausted : whether no other method is to be tried
     """
 
     impulse: Array

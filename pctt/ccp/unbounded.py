@@ -18,6 +18,8 @@ from pctt.ccp.cone import TINY, Array, tangential
 from pctt.ccp.delassus import ColumnMap, sums_of
 from pctt.ccp.problem import ConeProblem
 
+ROUNDED = 1e-4  # of the greatest eigenvalue of N: below it a negative one is of rounded digits, -1e-5 of five
+
 
 def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str:
     """The reason, in words, if the direction d = g / ||g|| of impulses g (nc, 3) in the cones shows that the problem is
@@ -50,6 +52,15 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
     if energy < -1e-12 * alone:
         return f"unbounded: N is indefinite, d'Nd = {energy / length:.1e} for a direction d of impulses"
     return f"unbounded: impulses grow without limit (norm {size:.1e} N s, {-along / size:.1e} J for each N s more)"
+
+
+def why_indefinite(problem: ConeProblem) -> str:
+    """The reason, in words, if N has a direction of negative curvature beyond rounded digits, so that what a method
+    finds need be no minimum; else "". The first time it takes some products with N. Collective."""
+    lowest = problem.comm.bcast(problem.lowest_curvature)
+    if lowest >= -ROUNDED:
+        return ""
+    return f"N is indefinite: d'Nd / d'd is {lowest:.1g} of the greatest for some impulses d"
 
 
 def why_unanswered(problem: ConeProblem, coulomb: bool) -> str:

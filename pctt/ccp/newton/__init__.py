@@ -166,6 +166,10 @@ class Newton:
         """Set the Newton matrix of a method with constraints and multipliers. Forms other than `kkt` eliminate them."""
         self._kkt = kkt
         if isinstance(self.system, KKTForm):
+            if self.system.constraints not in (0, kkt.f.shape[1]):  # those of another method
+                structure = self._structure
+                self.forget()
+                self.system, self._structure = KKTForm(self.problem), structure
             with phase("CCPUpdate"):
                 self.system.linearise(kkt)
                 self.linear.new_matrix(self.system)

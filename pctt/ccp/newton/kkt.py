@@ -58,6 +58,7 @@ class KKTForm(ContactForm):
     def __init__(self, problem: ConeProblem):
         super().__init__(problem)
         self.symmetric = False
+        self.constraints = 0  # of a contact, of the present matrix
 
     @cached_property
     def matrix(self) -> PETSc.Mat:
@@ -67,6 +68,7 @@ class KKTForm(ContactForm):
     def linearise(self, kkt: KKT) -> None:
         """Make the matrix."""
         nc, k = kkt.f.shape
+        self.constraints = k
         self.size = np.sqrt(np.square(kkt.df).sum(axis=2))
         along = kkt.df / self.size[:, :, None]
         self.row = self.size / -kkt.f
