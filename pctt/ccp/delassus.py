@@ -10,6 +10,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -345,7 +346,7 @@ def _product(indptr, indices, blocks, x):
 
 
 def ritz_values(
-    product: Callable[[Array], Array], start: Array, total: Callable[[Array], Array], steps: int = 30
+    product: Callable[[Array], Array], start: Array, total: Callable[[Any], Any], steps: int = 30
 ) -> Array:
     """The Ritz values, ascending, of a symmetric operator after Lanczos steps from a vector with parts on all ranks;
     ``total`` sums over them. The vectors are kept, and made orthogonal twice, so that the values are right to rounding.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Union
 
 import numpy as np
@@ -378,7 +379,7 @@ def _by_solves(comm: MPI.Comm, G: sp.csr_matrix, solve: Solve, together: bool) -
         low = min(begin + batch * BATCH, end)
         high = min(low + BATCH, end)
         own = slice(max(low, first), max(min(high, last), max(low, first)))
-        X = on_each(comm, "masses", lambda: solve(whole[low:high].T.toarray()))[:, own.start - low : own.stop - low]  # (n, rows)
+        X = on_each(comm, "masses", partial(solve, whole[low:high].T.toarray()))[:, own.start - low : own.stop - low]
         if on_any(comm, not np.isfinite(X).all())[0]:
             raise ValueError("masses: a solve returns a NaN or an infinite number")
         k = np.arange((own.stop - own.start) // 3)
