@@ -20,7 +20,7 @@ from petsc4py import PETSc
 from dem.contact_map import BlockRows, CompactRows
 from dem.exchange import on_each, refuse
 from pctt.ccp.accuracy import Accuracy, figures, measure
-from pctt.ccp.cone import Array, tangential
+from pctt.ccp.cones import Array, FrictionCones, RollingCones, tangential
 from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.door import Operator
 from pctt.ccp.newton import FORMS, Newton
@@ -28,7 +28,6 @@ from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.registry import MATRIX, NEWTON, SOLVERS, why_no_form, why_refused
 from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Counts, Limits, Result, Status
-from pctt.ccp.rolling import RollingProblem
 from pctt.ccp.unbounded import why_indefinite, why_unanswered, why_unbounded
 from pctt.log import phase
 
@@ -44,11 +43,12 @@ __all__ = [
     "CompactRows",
     "Comparison",
     "ConeProblem",
+    "FrictionCones",
     "Limits",
     "Newton",
     "Operator",
     "Result",
-    "RollingProblem",
+    "RollingCones",
     "Status",
     "measure",
     "newton_for",
@@ -75,7 +75,7 @@ def solve(
     Coulomb's law is found by the method itself if it can (`Solver.has_law`), else by a sequence of cone problems
     (`pctt.ccp.coulomb`).
 
-    A `RollingProblem`, whose impulses are (2 nc, 3), is for `conic`, `apgd` and `auto`. A problem given by a
+    A problem with `RollingCones`, whose impulses are (2 nc, 3), is for `conic`, `apgd` and `auto`. A problem given by a
     `pctt.ccp.Operator` is for all methods but `gauss_seidel`; ValueError for a preconditioner that reads entries.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
@@ -87,11 +87,10 @@ def solve(
         raise ValueError(f"the solver {type!r}: allowed are {', '.join(SOLVERS)}")
     if law not in LAWS:
         raise ValueError(f"the law {law!r}: allowed are {', '.join(LAWS)}")
-    rolls = isinstance(problem, RollingProblem)
-    if why := why_refused(type, rolls):
+    if why := why_refused(type, problem.cones.__class__):
         raise ValueError(f"the solver {type!r}: the problem has {why}")
-    if rolls and newton is not None and newton.form != "body":
-        raise ValueError(f"the Newton form {newton.form!r}: with rolling or spinning resistance allowed is body")
+    if problem.cones.parts > 1 and newton is not None and newton.form != "body":
+        raise ValueError(f"the Newton form {newton.form!r}: with {problem.cones.what} allowed is body")
     _refuse_form(type, newton.form if newton is not None else "")
     if not problem.has_entries and SOLVERS[type].needs == MATRIX:
         allowed = ", ".join(name for name, method in SOLVERS.items() if method.needs != MATRIX)
@@ -187,9 +186,9 @@ def _states(problem: ConeProblem, g: Array, y: Array, coulomb: bool) -> NDArray[
     """Which contacts (nc,) are open (0), slide (1) and stick (2): of each two numbers that are complementary, impulses
     in units of velocities, the larger one decides."""
     nc, d, cones = problem.cones.count, problem.diagonal, problem.cones
-    opening = y[:nc, 0] if coulomb else y[:nc, 0] - cones.resisted(y)
+    opening = y[:nc, 0] if coulomb else y[:nc, 0] - cones.de_saxce(y)
     open_ = d[:nc, 0] * g[:nc, 0] <= opening
-    room = 0.5 * (d[:nc, 1] + d[:nc, 2]) * (problem.mu[:nc] * g[:nc, 0] - tangential(g[:nc]))
+    room = 0.5 * (d[:nc, 1] + d[:nc, 2]) * (problem.mu * g[:nc, 0] - tangential(g[:nc]))
     return np.where(open_, 0, np.where(room < tangential(y[:nc]), 1, 2)).astype(np.int8)
 
 

@@ -21,7 +21,7 @@ from scipy.sparse.linalg import LinearOperator, splu
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
 from dem.exchange import on_any, on_each, reduced, refuse
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array, Cones
 from pctt.ccp.delassus import BlockMap, ColumnMap, GivenMatrix, GivenOperator, rows_of
 
 FULL = 10_000  # rows up to which N is found by a product with each unit vector, if nothing but products is known
@@ -76,7 +76,7 @@ class Contacts:
     given_r: Array
 
 
-def contacts_of(comm: MPI.Comm, r: Any, mu: Any, **data: Any) -> Contacts:
+def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: Any) -> Contacts:
     """The contacts of velocities r (nc, 3) and friction mu (nc,) or, for each tangent, (nc, 2); in the plane r is
     (nc, 2). ValueError on all ranks for others, for what does not fit of a problem's other ``data``, and for what is of
     another kind on another rank.
@@ -85,20 +85,28 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, **data: Any) -> Contacts:
     contact of the plane has the friction 0 along its second tangent, in which nothing moves."""
     kinds = [[kind_of(data.get(name)) == kind for kind in KINDS] for name in COLLECTIVE]
     N = data.pop("N", None)
-    words = _wrong_contacts(r, mu, **data)
+    parts = 1 if cones is None else cones.parts
+    if (mu is None) == (cones is None):
+        words = "a cone problem has either mu or cones"
+    elif cones is not None:
+        words = cones.why_refused() or _wrong_contacts(r, mu := cones.mu, parts=parts, **data)
+    else:
+        words = _wrong_contacts(r, mu, **data)
     if (data.get("G") is None) == (N is None):
         words = "a cone problem is given by either the map G or the matrix N"
     velocity, friction = (np.zeros(0), np.zeros(0)) if words else (np.asarray(each, dtype=float) for each in (r, mu))
     flat, space = velocity.ndim == 2 and velocity.shape[1] == 2, velocity.ndim == 2 and velocity.shape[1] == 3
     space = space or (velocity.ndim == 1 and velocity.size > 0)
-    every = on_any(comm, bool(words), flat, space, friction.ndim == 2, *sum(kinds, []))
-    wrong, plane, space, elliptic = every[:4]
+    facts = bool(words), flat, space, friction.ndim == 2, parts == 1, parts > 1
+    wrong, plane, space, elliptic, plain, moments, *every = on_any(comm, *facts, *sum(kinds, []))
     if wrong:
         refuse(comm, words)
     for k, name in enumerate(COLLECTIVE):
-        found = [kind for kind, there in zip(KINDS, every[4 + k * len(KINDS) :]) if there]
+        found = [kind for kind, there in zip(KINDS, every[k * len(KINDS) :]) if there]
         if len(found) > 1:
             raise ValueError(f"{name} is {' on some ranks, and '.join(found)} on others; allowed is one of them on all")
+    if plain and moments:
+        raise ValueError("cones have moments on some ranks, and none on others; allowed is one of both")
     if plane and space:
         raise ValueError("r has 2 columns on some ranks and 3 on others; allowed is one of both")
     width = 2 if plane else 3
@@ -143,8 +151,9 @@ def padded(rows: Array) -> Array:
 
 
 def _wrong_contacts(
-    r: Any, mu: Any, G: Any = None, masses: Any = None, point: Any = None, key: Any = None, compliance: Any = 0.0
-) -> str:
+    r: Any, mu: Any, G: Any = None, masses: Any = None, point: Any = None, key: Any = None, compliance: Any = 0.0,
+    parts: int = 1,
+) -> str:  # fmt: skip
     """What is wrong with a problem's data on this rank, but for its matrices; empty if nothing is."""
     try:
         velocity, friction, soft = map(_real, (r, mu, compliance))
@@ -154,7 +163,11 @@ def _wrong_contacts(
     width = 2 if len(shape) == 2 and shape[1] == 2 else 3
     if not (len(shape) == 2 and shape[1] in (2, 3)) and not (len(shape) == 1 and shape[0] % 3 == 0):
         return f"r has the shape {shape}; allowed is (nc, 3), or (nc, 2) for contacts of the plane"
-    nc = velocity.size // width
+    nc = velocity.size // (width * parts)
+    if parts > 1 and not (width == 3 and velocity.size == 3 * parts * len(friction)):
+        return f"r has the shape {shape}; allowed is {(parts * len(friction), 3)} with these cones"
+    if parts > 1 and not isinstance(G, (BlockRows, CompactRows, ContactMap)):
+        return f"G is of the type {type(G).__name__}; allowed with moments are BlockRows and a ContactMap"
     for name, given, allowed in (
         ("mu", friction, [(nc,), (nc, 2)][: width - 1]),
         ("point", point, [(nc, 3)]),
@@ -176,8 +189,8 @@ def _wrong_contacts(
     if friction.ndim == 2 and soft.ndim == 2 and soft[:, 1].any():
         return "compliance of tangents, with friction per direction; allowed with it is compliance of normals"
     if isinstance(G, (BlockRows, CompactRows, ContactMap)):
-        if G.rows != nc:
-            return f"G has {G.rows} contacts, but r has {nc}"
+        if G.rows != parts * nc:
+            return f"G has {G.rows} contacts, but r has {parts * nc}"
         if width == 2:
             return f"G is of the type {type(G).__name__}; allowed for contacts of the plane are {MATRICES}"
         if masses is not None:

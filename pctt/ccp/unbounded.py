@@ -14,7 +14,7 @@ from dem.compiled import loop
 from dem.contact_map import find_halo
 from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
-from pctt.ccp.cone import TINY, Array, tangential
+from pctt.ccp.cones import TINY, Array, tangential
 from pctt.ccp.delassus import ColumnMap, sums_of
 from pctt.ccp.problem import ConeProblem
 
@@ -38,7 +38,9 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
     if problem.all_yield:
         return ""
     largest = problem.max(_largest(g))
-    parts = _parts(g, problem.r, problem.mu, problem.compliance, problem.diagonal, max(largest, 1e-300))
+    parts = _parts(
+        g, problem.r, problem.cones.first_tangents, problem.compliance, problem.diagonal, max(largest, 1e-300)
+    )
     along, closing, yielding, length, alone = problem.sum(np.array(parts)).tolist()
     size, speed = math.sqrt(length), math.sqrt(closing)
     bound = (along / (1e3 * size * speed)) ** 2 if along < 0 < size * speed else 0.0
@@ -66,7 +68,7 @@ def why_indefinite(problem: ConeProblem) -> str:
 def why_unanswered(problem: ConeProblem, coulomb: bool) -> str:
     """The reason, in words, if contacts that no impulse moves close, so that the problem is unbounded, or none obeys
     Coulomb's law; else "". For these contacts the test N d = 0, r.d < 0 with d in the cones is exact. Collective."""
-    if not problem.unanswered or len(problem.r) != problem.cones.count:
+    if not problem.unanswered or problem.cones.parts > 1:
         return ""
     slip = tangential(problem.r)
     falls = problem.r[:, 0] - (0.0 if coulomb else problem.mu * slip)

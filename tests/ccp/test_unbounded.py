@@ -9,6 +9,7 @@ from problems import SELF, from_graph, from_matrix, heap, matrix
 
 from pctt import ccp
 from pctt.ccp import BlockRows, Limits, Status
+from pctt.ccp.cones.friction import project
 from pctt.ccp.unbounded import why_unbounded
 
 SOLVERS = pytest.mark.parametrize("solver", ["conic", "pdip", "apgd", "auto"])
@@ -93,7 +94,7 @@ def test_problems_with_a_solution_are_never_named(seed):
     problem = from_graph(known, graph)
     rng = np.random.default_rng(seed)
     for size in (1e-3, 1.0, 1e3, 1e9):
-        g = ccp.cone.project(known.g + size * rng.normal(size=known.g.shape), known.mu)
+        g = project(known.g + size * rng.normal(size=known.g.shape), known.mu)
         assert why_unbounded(problem, g) == ""
 
 

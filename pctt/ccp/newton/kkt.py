@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 
 from pctt.blocks import new_matrix, set_diagonal_blocks, symmetric_shell
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array
 from pctt.ccp.delassus import rows_in_blocks
 from pctt.ccp.newton.forms import ContactForm
 from pctt.ccp.problem import ConeProblem
