@@ -118,6 +118,22 @@ def refuse(comm: MPI.Comm, wrong: str) -> None:
             raise ValueError(words + (f" (on rank {rank})" if comm.size > 1 else ""))
 
 
+def on_each(comm: MPI.Comm, what: str, work: Callable[[], Out]) -> Out:
+    """What a user's `work` gives on this rank. If it raises on any of several ranks, all raise a RuntimeError that says
+    `what` was called. Collective."""
+    if comm.size == 1:
+        return work()
+    error, value, words = None, None, ""
+    try:
+        value = work()
+    except Exception as raised:
+        error, words = raised, f"{what}: {type(raised).__name__}: {raised}"
+    if on_any(comm, error is not None)[0]:
+        rank, words = next((rank, each) for rank, each in enumerate(comm.allgather(words)) if each)
+        raise RuntimeError(f"{words} (on rank {rank})") from error
+    return value  # type: ignore[return-value]
+
+
 def on_first(comm: MPI.Comm, work: Callable[[], Out]) -> Out:
     """What `work` gives on the first rank, on all ranks, or the error that it raises there. Collective."""
     value, error = None, None

@@ -539,7 +539,7 @@ problem = ccp.ConeProblem(MPI.COMM_SELF, r=np.tile([-1.0, 0.3, 0.0], (8, 1)), mu
 result = ccp.solve(problem)
 print(result.status, "with pressures", result.impulse[:, 0].round(3))
 
-# %% pctt.ccp.RollingProblem, dem.contact_map.TurningMap
+# %% pctt.ccp.FrictionCones, pctt.ccp.RollingCones, dem.contact_map.TurningMap
 from mpi4py import MPI
 
 import pctt

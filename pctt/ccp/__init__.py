@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows
-from dem.exchange import refuse
+from dem.exchange import on_each, refuse
 from pctt.ccp.accuracy import Accuracy, figures, measure
-from pctt.ccp.cone import Array, tangential
+from pctt.ccp.cones import Array, FrictionCones, RollingCones, tangential
 from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.door import Operator
 from pctt.ccp.newton import FORMS, Newton
@@ -28,8 +28,7 @@ from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.registry import MATRIX, NEWTON, SOLVERS, why_no_form, why_refused
 from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Counts, Limits, Result, Status
-from pctt.ccp.rolling import RollingProblem
-from pctt.ccp.unbounded import why_unanswered, why_unbounded
+from pctt.ccp.unbounded import why_indefinite, why_unanswered, why_unbounded
 from pctt.log import phase
 
 __all__ = [
@@ -44,11 +43,12 @@ __all__ = [
     "CompactRows",
     "Comparison",
     "ConeProblem",
+    "FrictionCones",
     "Limits",
     "Newton",
     "Operator",
     "Result",
-    "RollingProblem",
+    "RollingCones",
     "Status",
     "measure",
     "newton_for",
@@ -75,7 +75,7 @@ def solve(
     Coulomb's law is found by the method itself if it can (`Solver.has_law`), else by a sequence of cone problems
     (`pctt.ccp.coulomb`).
 
-    A `RollingProblem`, whose impulses are (2 nc, 3), is for `conic`, `apgd` and `auto`. A problem given by a
+    A problem with `RollingCones`, whose impulses are (2 nc, 3), is for `conic`, `apgd` and `auto`. A problem given by a
     `pctt.ccp.Operator` is for all methods but `gauss_seidel`; ValueError for a preconditioner that reads entries.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
@@ -87,18 +87,18 @@ def solve(
         raise ValueError(f"the solver {type!r}: allowed are {', '.join(SOLVERS)}")
     if law not in LAWS:
         raise ValueError(f"the law {law!r}: allowed are {', '.join(LAWS)}")
-    rolls = isinstance(problem, RollingProblem)
-    if why := why_refused(type, rolls):
+    if why := why_refused(type, problem.cones.__class__):
         raise ValueError(f"the solver {type!r}: the problem has {why}")
-    if rolls and newton is not None and newton.form != "body":
-        raise ValueError(f"the Newton form {newton.form!r}: with rolling or spinning resistance allowed is body")
+    if problem.cones.parts > 1 and newton is not None and newton.form != "body":
+        raise ValueError(f"the Newton form {newton.form!r}: with {problem.cones.what} allowed is body")
     _refuse_form(type, newton.form if newton is not None else "")
     if not problem.has_entries and SOLVERS[type].needs == MATRIX:
         allowed = ", ".join(name for name, method in SOLVERS.items() if method.needs != MATRIX)
         raise ValueError(f"the solver {type!r} reads rows of N, but N is given by its products; allowed are {allowed}")
     limits = limits or Limits()
     if monitor is not None or limits.monitor:
-        limits = dataclasses.replace(limits, watch=monitor or partial(_print, problem.comm))
+        watch = monitor or partial(_print, problem.comm)
+        limits = dataclasses.replace(limits, watch=lambda *at: on_each(problem.comm, "monitor", lambda: watch(*at)))
     if not limits.tol > 0.0:
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
     result = asked = _by(type, problem, _start(problem, guess), limits, options, newton, law)
@@ -161,6 +161,8 @@ def _by(
         result.impulse, result.status, result.residual = nothing, Status.BREAKDOWN, cold
     elif unbounded := why_unbounded(problem, result.impulse):
         result.status, result.reason = Status.UNBOUNDED, unbounded
+    elif result.converged and (indefinite := why_indefinite(problem)):
+        result.status, result.reason, result.exhausted = Status.BREAKDOWN, indefinite, True
     accuracy = _measure(problem, result)
     if result.converged and (squeezed := limits.squeezed(accuracy, coulomb)):
         result.status, result.reason = Status.SQUEEZED, squeezed
@@ -184,9 +186,9 @@ def _states(problem: ConeProblem, g: Array, y: Array, coulomb: bool) -> NDArray[
     """Which contacts (nc,) are open (0), slide (1) and stick (2): of each two numbers that are complementary, impulses
     in units of velocities, the larger one decides."""
     nc, d, cones = problem.cones.count, problem.diagonal, problem.cones
-    opening = y[:nc, 0] if coulomb else y[:nc, 0] - cones.resisted(y)
+    opening = y[:nc, 0] if coulomb else y[:nc, 0] - cones.de_saxce(y)
     open_ = d[:nc, 0] * g[:nc, 0] <= opening
-    room = 0.5 * (d[:nc, 1] + d[:nc, 2]) * (problem.mu[:nc] * g[:nc, 0] - tangential(g[:nc]))
+    room = 0.5 * (d[:nc, 1] + d[:nc, 2]) * (problem.mu * g[:nc, 0] - tangential(g[:nc]))
     return np.where(open_, 0, np.where(room < tangential(y[:nc]), 1, 2)).astype(np.int8)
 
 
@@ -198,8 +200,13 @@ def _start(problem: ConeProblem, guess: Array | None) -> Array:
     """The guess in the cones (nc, 3), zero without one; ValueError on all ranks for another shape or if it is no
     number."""
     none = np.zeros_like(problem.r)
-    start = problem.shown(none) if guess is None else np.ascontiguousarray(guess, dtype=float)
-    wrong = "" if np.isfinite(start).all() else "a guess with a NaN or an infinite number"
+    start, wrong = problem.shown(none), ""
+    try:
+        start = start if guess is None else np.ascontiguousarray(guess, dtype=float)
+    except (TypeError, ValueError) as error:
+        wrong = f"a guess of no numbers: {error}"
+    if not np.isfinite(start).all():
+        wrong = "a guess with a NaN or an infinite number"
     if start.shape != problem.shown(none).shape:
         wrong = f"a guess of shape {start.shape}; allowed is {problem.shown(none).shape}"
     refuse(problem.comm, wrong)

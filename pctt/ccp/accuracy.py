@@ -12,9 +12,8 @@ import numpy as np
 
 from dem.compiled import inlined, loop
 from dem.exchange import reduced
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array, FrictionCones
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.rolling import RollingProblem
 
 ROUNDINGS = 8.0 * float(np.finfo(float).eps)
 
@@ -62,11 +61,11 @@ def measure(problem: ConeProblem, impulse: Array) -> Accuracy:
 def figures(problem: ConeProblem, g: Array, rigid: Array) -> Accuracy:
     """Those of an impulse g (nc, 3) in the cones, whose velocities are ``rigid`` without compliance and r."""
     step = 1.0 / problem.mean_diagonal
-    if isinstance(problem, RollingProblem):
-        sums, greatest = _judged_rolling(problem, g, rigid + problem.compliance * g + problem.r, step)
-    else:
-        soft = problem.compliance[: None if problem.yields else 0]
+    soft = problem.compliance[: None if problem.yields else 0]
+    if type(problem.cones) is FrictionCones:
         sums, greatest = _judged(g, rigid, soft, problem.r, problem.mu, step)
+    else:
+        sums, greatest = _judged_discs(problem, g, rigid + problem.compliance * g + problem.r, step)
     of_all, (cone, dual, complementarity, closes) = reduced(problem.comm, sums, greatest)
     square, speed, power, pushed, closing, opening, natural, coulomb = of_all
     norm, energy = float(np.sqrt(square)), 0.5 * pushed
@@ -145,36 +144,33 @@ def _nearest_in_cone(n, u, v, mu):
     return n, u, v
 
 
-def _judged_rolling(problem: RollingProblem, g: Array, y: Array, step: float) -> tuple[Array, Array]:
-    """The figures of `_judged` with resistance to rolling and spinning; the height of a projection by Newton's method,
-    whose steps ascend to it from below and end after three, as the function is concave with three kinks."""
-    nc, r = len(problem.spinning), problem.r
-    most = np.stack([problem.mu[:nc], problem.mu[nc:], problem.spinning])
+def _judged_discs(problem: ConeProblem, g: Array, y: Array, step: float) -> tuple[Array, Array]:
+    """The figures of `_judged` for any cones that discs meet; the height of a projection by Newton's method, whose
+    steps ascend to it from below and end after one for each disc, as the function is concave with as many kinks."""
+    cones, most = problem.cones, problem.cones.coefficients
+    g, y, r = (cones.joined(x) for x in (g, y, problem.r))
 
     def parts(x: Array) -> tuple[Array, Array]:
-        sizes = np.hypot(x[:nc, 1], x[:nc, 2]), np.hypot(x[nc:, 1], x[nc:, 2]), np.abs(x[nc:, 0])
-        return x[:nc, 0], np.stack(sizes)
+        return x[:, 0], np.stack([np.sqrt(np.square(x[:, list(part)]).sum(axis=1)) for part in cones.tangents])
 
     def squared_move(y_n: Array) -> float:
         target = g - step * y
-        target[:nc, 0] = g[:nc, 0] - step * y_n
+        target[:, 0] = g[:, 0] - step * y_n
         normal, sizes = parts(target)
         height = normal
-        for _ in range(5):
+        for _ in range(len(most) + 2):
             beyond = sizes > most * height
             height = (normal + (most * sizes * beyond).sum(axis=0)) / (1.0 + (most**2 * beyond).sum(axis=0))
         height = np.maximum(height, 0.0)
         shrink = np.minimum(1.0, most * height / np.maximum(sizes, 1e-300))
-        target[:nc] *= np.stack([np.ones(nc), shrink[0], shrink[0]], axis=1)
-        target[nc:] *= np.stack([shrink[2], shrink[1], shrink[1]], axis=1)
-        target[:nc, 0] = height
-        squares = ((target - g) ** 2).sum(axis=1).reshape(2, nc).sum(axis=0)
-        noise = ROUNDINGS * step * np.sqrt((y * y).sum(axis=1).reshape(2, nc).sum(axis=0))
+        target[:, 0] = height
+        for part, factor in zip(cones.tangents, shrink):
+            target[:, list(part)] *= factor[:, None]
+        squares, noise = np.square(target - g).sum(axis=1), ROUNDINGS * step * np.sqrt(np.square(y).sum(axis=1))
         return float(squares[~(np.sqrt(squares) <= noise)].sum())
 
     (g_n, sizes), (y_n, speeds) = parts(g), parts(y)
     resisted, along = (most * speeds).sum(axis=0), np.einsum("ck,ck->c", g, y)
-    along = along[:nc] + along[nc:]
     sums = [
         np.vdot(g, g), np.vdot(y, y), np.vdot(g, y + r), np.vdot(g, y - r),
         g_n @ np.maximum(-y_n, 0.0), np.maximum(along, 0.0).sum(), squared_move(y_n), squared_move(y_n + resisted),

@@ -23,7 +23,7 @@ from functools import partial
 import numpy as np
 
 from pctt.ccp import gathered
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array
 from pctt.ccp.coulomb import Coulomb, fixed_point
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
@@ -157,7 +157,7 @@ class Attempts:
             self.keep(replace(relaxed, status=Status.UNBOUNDED, reason=f"of the relaxation, {why}"), "conic")
             return
         last = relaxed = replace(relaxed, status=Status.STALLED, residual=np.inf, reason="relaxation")
-        if len(problem.r) == problem.cones.count:  # without moments, whose terms it does not have
+        if problem.cones.parts == 1:  # without moments, whose terms it does not have
             last = fixed_point(lambda g, to: by_conic(guess=g, limits=to), problem, relaxed.impulse, limits, TERMS)
             last.after(relaxed)
         self.keep(last, "conic").exhausted = True

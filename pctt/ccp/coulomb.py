@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pctt.ccp.cone import Array, tangential
+from pctt.ccp.cones import Array, tangential
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import FIXED_POINT, Limits, Result, Status
 from pctt.options import number

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Union
 
 import numpy as np
@@ -19,8 +20,8 @@ from scipy.sparse.csgraph import structural_rank
 from scipy.sparse.linalg import LinearOperator, splu
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
-from dem.exchange import on_any, reduced, refuse
-from pctt.ccp.cone import Array
+from dem.exchange import on_any, on_each, reduced, refuse
+from pctt.ccp.cones import Array, Cones
 from pctt.ccp.delassus import BlockMap, ColumnMap, GivenMatrix, GivenOperator, rows_of
 
 FULL = 10_000  # rows up to which N is found by a product with each unit vector, if nothing but products is known
@@ -29,6 +30,9 @@ BATCH = 300  # rows of N that are made together
 ALIKE = 1e-6  # of the largest entry of a matrix: by how much an entry may differ from its mirror image
 #: types of Mats that have entries; others are known by their products
 WITH_ENTRIES = ("aij", "baij", "sbaij", "dense", "nest", "sell", "is")
+#: what is the same on all ranks, and the kinds of it
+COLLECTIVE = ("N", "G", "masses", "point", "key")
+KINDS = ("not given", "an object of PETSc", "a map of bodies", "a function or a factor", "a matrix", "a vector")
 MATRICES = "a two-dimensional array, a scipy sparse matrix, a PETSc Mat"
 
 Solve = Callable[[Array], Array]
@@ -72,19 +76,37 @@ class Contacts:
     given_r: Array
 
 
-def contacts_of(comm: MPI.Comm, r: Any, mu: Any, **rest: Any) -> Contacts:
+def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: Any) -> Contacts:
     """The contacts of velocities r (nc, 3) and friction mu (nc,) or, for each tangent, (nc, 2); in the plane r is
-    (nc, 2). ValueError on all ranks for others, and for what does not fit of the ``rest`` of a problem's data.
+    (nc, 2). ValueError on all ranks for others, for what does not fit of a problem's other ``data``, and for what is of
+    another kind on another rank.
 
     |g_1 / mu_1, g_2 / mu_2| <= g_n is a circular cone of friction mu = max mu_k in the impulses g_k mu / mu_k. A
     contact of the plane has the friction 0 along its second tangent, in which nothing moves."""
-    words = _wrong_contacts(r, mu, **rest)
+    kinds = [[kind_of(data.get(name)) == kind for kind in KINDS] for name in COLLECTIVE]
+    N = data.pop("N", None)
+    parts = 1 if cones is None else cones.parts
+    if (mu is None) == (cones is None):
+        words = "a cone problem has either mu or cones"
+    elif cones is not None:
+        words = cones.why_refused() or _wrong_contacts(r, mu := cones.mu, parts=parts, **data)
+    else:
+        words = _wrong_contacts(r, mu, **data)
+    if (data.get("G") is None) == (N is None):
+        words = "a cone problem is given by either the map G or the matrix N"
     velocity, friction = (np.zeros(0), np.zeros(0)) if words else (np.asarray(each, dtype=float) for each in (r, mu))
     flat, space = velocity.ndim == 2 and velocity.shape[1] == 2, velocity.ndim == 2 and velocity.shape[1] == 3
     space = space or (velocity.ndim == 1 and velocity.size > 0)
-    wrong, plane, space, elliptic = on_any(comm, bool(words), flat, space, friction.ndim == 2)
+    facts = bool(words), flat, space, friction.ndim == 2, parts == 1, parts > 1
+    wrong, plane, space, elliptic, plain, moments, *every = on_any(comm, *facts, *sum(kinds, []))
     if wrong:
         refuse(comm, words)
+    for k, name in enumerate(COLLECTIVE):
+        found = [kind for kind, there in zip(KINDS, every[k * len(KINDS) :]) if there]
+        if len(found) > 1:
+            raise ValueError(f"{name} is {' on some ranks, and '.join(found)} on others; allowed is one of them on all")
+    if plain and moments:
+        raise ValueError("cones have moments on some ranks, and none on others; allowed is one of both")
     if plane and space:
         raise ValueError("r has 2 columns on some ranks and 3 on others; allowed is one of both")
     width = 2 if plane else 3
@@ -99,6 +121,19 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, **rest: Any) -> Contacts:
     if plane:
         units[:, 2] = 0.0
     return Contacts(width, units, units * velocity, most, velocity)
+
+
+def kind_of(given: Any) -> str:
+    """Which of KINDS a part of a problem's data is: ranks that take one for another would wait for each other."""
+    if given is None:
+        return KINDS[0]
+    if isinstance(given, PETSc.Object):
+        return KINDS[1]
+    if isinstance(given, (BlockRows, CompactRows, ContactMap)):
+        return KINDS[2]
+    if callable(given) or isinstance(given, tuple) or hasattr(given, "mult") or hasattr(given, "solve"):
+        return KINDS[3]
+    return KINDS[4] if sp.issparse(given) or np.ndim(given) == 2 else KINDS[5]
 
 
 def wrong_velocities(r: Any, shape: tuple[int, ...]) -> str:
@@ -116,8 +151,9 @@ def padded(rows: Array) -> Array:
 
 
 def _wrong_contacts(
-    r: Any, mu: Any, G: Any = None, masses: Any = None, point: Any = None, key: Any = None, compliance: Any = 0.0
-) -> str:
+    r: Any, mu: Any, G: Any = None, masses: Any = None, point: Any = None, key: Any = None, compliance: Any = 0.0,
+    parts: int = 1,
+) -> str:  # fmt: skip
     """What is wrong with a problem's data on this rank, but for its matrices; empty if nothing is."""
     try:
         velocity, friction, soft = map(_real, (r, mu, compliance))
@@ -127,7 +163,11 @@ def _wrong_contacts(
     width = 2 if len(shape) == 2 and shape[1] == 2 else 3
     if not (len(shape) == 2 and shape[1] in (2, 3)) and not (len(shape) == 1 and shape[0] % 3 == 0):
         return f"r has the shape {shape}; allowed is (nc, 3), or (nc, 2) for contacts of the plane"
-    nc = velocity.size // width
+    nc = velocity.size // (width * parts)
+    if parts > 1 and not (width == 3 and velocity.size == 3 * parts * len(friction)):
+        return f"r has the shape {shape}; allowed is {(parts * len(friction), 3)} with these cones"
+    if parts > 1 and not isinstance(G, (BlockRows, CompactRows, ContactMap)):
+        return f"G is of the type {type(G).__name__}; allowed with moments are BlockRows and a ContactMap"
     for name, given, allowed in (
         ("mu", friction, [(nc,), (nc, 2)][: width - 1]),
         ("point", point, [(nc, 3)]),
@@ -149,8 +189,8 @@ def _wrong_contacts(
     if friction.ndim == 2 and soft.ndim == 2 and soft[:, 1].any():
         return "compliance of tangents, with friction per direction; allowed with it is compliance of normals"
     if isinstance(G, (BlockRows, CompactRows, ContactMap)):
-        if G.rows != nc:
-            return f"G has {G.rows} contacts, but r has {nc}"
+        if G.rows != parts * nc:
+            return f"G has {G.rows} contacts, but r has {parts * nc}"
         if width == 2:
             return f"G is of the type {type(G).__name__}; allowed for contacts of the plane are {MATRICES}"
         if masses is not None:
@@ -266,10 +306,13 @@ def _by_products(comm: MPI.Comm, nc: int, width: int, N: Any) -> GivenOperator: 
     mult = _product(comm, N.mult, nc, width)
 
     def product(g: Array) -> Array:
-        y = np.asarray(mult(np.ascontiguousarray(g[:, :width])), dtype=float)
+        return padded(on_each(comm, "N.mult", lambda: rows(np.ascontiguousarray(g[:, :width]))))
+
+    def rows(g: Array) -> Array:
+        y = np.asarray(mult(g), dtype=float)
         if y.size != nc * width:
             raise ValueError(f"N.mult returns the shape {y.shape}; allowed is {(nc, width)}")
-        return padded(y.reshape(nc, width))
+        return y.reshape(nc, width)
 
     in_space = np.zeros((nc, 3, 3))
     in_space[:, :width, :width] = blocks
@@ -349,7 +392,7 @@ def _by_solves(comm: MPI.Comm, G: sp.csr_matrix, solve: Solve, together: bool) -
         low = min(begin + batch * BATCH, end)
         high = min(low + BATCH, end)
         own = slice(max(low, first), max(min(high, last), max(low, first)))
-        X = solve(whole[low:high].T.toarray())[:, own.start - low : own.stop - low]  # (n, rows)
+        X = on_each(comm, "masses", partial(solve, whole[low:high].T.toarray()))[:, own.start - low : own.stop - low]
         if on_any(comm, not np.isfinite(X).all())[0]:
             raise ValueError("masses: a solve returns a NaN or an infinite number")
         k = np.arange((own.stop - own.start) // 3)
@@ -368,7 +411,8 @@ def _by_solves(comm: MPI.Comm, G: sp.csr_matrix, solve: Solve, together: bool) -
 
     def product(g: Array) -> Array:
         momentum = G.T @ g.ravel()
-        return (G @ solve(comm.allreduce(momentum)[:, None])[:, 0]).reshape(-1, 3)
+        momentum = comm.allreduce(momentum)[:, None]
+        return (G @ on_each(comm, "masses", lambda: solve(momentum))[:, 0]).reshape(-1, 3)
 
     return GivenOperator(comm, blocks, product)
 

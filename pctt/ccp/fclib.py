@@ -30,10 +30,9 @@ from scipy.sparse.linalg import MatrixRankWarning, spsolve
 
 from dem.contact_map import BlockRows
 from pctt.blocks import square_block_matrix
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array, Cones, FrictionCones, RollingCones
 from pctt.ccp.delassus import HUB, rows_in_blocks
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.rolling import RollingProblem
 from pctt.disk import FileError, hdf5, refuse_links, whole
 
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]
@@ -83,8 +82,8 @@ class Solution:
 
 
 def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
-    """The cone problem of an FCLIB file, its contacts in equal parts over the ranks; collective. One with rolling is a
-    `RollingProblem`, whose M must have 6 x 6 blocks.
+    """The cone problem of an FCLIB file, its contacts in equal parts over the ranks; collective. One with rolling has
+    `RollingCones`, and its M must have 6 x 6 blocks.
 
     A local problem is given by N = W. A global one is given by the map G = H' L^-T of the bodies, with M = L L', where
     M has 6 x 6 blocks on its diagonal and nothing else, and otherwise by N = H' M^-1 H. Raises FileFormatError on every
@@ -116,10 +115,10 @@ def load(path: str | Path, comm: MPI.Comm) -> Stored:
             operator = {"N": (N := square_block_matrix(comm, rows))}
         more = {name: part[name] for name in ("point", "compliance")}
         if (rolling := part["mu_r"]) is None:
-            problem = ConeProblem(comm, part["r"], part["mu"], **operator, **more)
+            cones: Cones = FrictionCones(part["mu"])
         else:
-            more |= {"rolling": rolling, "spinning": np.zeros_like(rolling)}
-            problem = RollingProblem(comm, part["r"], part["mu"], **operator, **more)
+            cones = RollingCones(part["mu"], rolling, np.zeros_like(rolling))
+        problem = ConeProblem(comm, part["r"], cones=cones, **operator, **more)
     except ValueError as reason:  # on all ranks alike
         raise FileFormatError(f"{path}: no FCLIB problem: {reason}") from None
     finally:
@@ -328,8 +327,11 @@ def write_local(
     """Write N, r, mu of a problem as W, q, mu of a local problem; collective.
 
     W is that of rigid contacts; the compliance is kept outside the groups of FCLIB. Raises OSError on all ranks if
-    the file cannot be written, ValueError if a body has so many contacts that it would fill W.
+    the file cannot be written, ValueError if a body has so many contacts that it would fill W, or contacts have
+    moments.
     """
+    if problem.cones.parts > 1:
+        raise ValueError(f"the problem has {problem.cones.what}, which is read but not written")
     if problem.has_hubs:
         raise ValueError(f"a body has more than {HUB} contacts and would fill N; allowed is fclib.write_global")
     N = problem.rigid_matrix()

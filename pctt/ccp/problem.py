@@ -14,8 +14,8 @@ from dem.compiled import loop
 from dem.contact_map import BlockRows
 from dem.exchange import reduced, refuse
 from pctt.ccp import door
-from pctt.ccp.cone import Array, FrictionCones
-from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, without_hubs
+from pctt.ccp.cones import TINY, Array, Cones, FrictionCones
+from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, ritz_values, without_hubs
 
 
 class Errors(NamedTuple):
@@ -45,6 +45,8 @@ class ConeProblem:
     r : (nc, 3) velocities of the contacts without impulses, plus gap/dt (m/s); (nc, 2) for contacts of the plane, whose
         N and G have two rows for each, of the normal and of the tangent
     mu : (nc,) friction coefficients, or (nc, 2), of each tangent, in elliptic cones |g_1 / mu_1, g_2 / mu_2| <= g_n
+    cones : in its place, cones of `pctt.ccp`: `RollingCones` have moments too, r, G and impulses twice as many rows of
+        3 (`dem.contact_map.TurningMap`), those of the forces first; then G is a map between bodies
     N : a numpy array, a scipy matrix, a PETSc Mat, or a `pctt.ccp.Operator`: products and diagonal blocks
     G : a numpy array, a scipy matrix or a PETSc Mat (3 nc, n); `BlockRows`, `CompactRows` or a `ContactMap`, which are
         scaled by M^-1/2
@@ -67,7 +69,6 @@ class ConeProblem:
     compliance : (nc, 3) the diagonal of C, (C_n, C_t, C_t) per contact (1/kg); given as C_n, a number or (nc,), or as
         (nc, 2)
     yields : whether C is not zero, the same on all ranks
-    cones : those of the contacts of this rank
     size : contacts on all ranks, Nc
     unanswered : contacts on all ranks that no impulse moves: N has zeros in their rows
     mean_diagonal : mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts
@@ -77,8 +78,9 @@ class ConeProblem:
         self,
         comm: MPI.Comm,
         r: Array,
-        mu: Array,
+        mu: Array | None = None,
         *,
+        cones: Cones | None = None,
         G: door.Given | None = None,
         N: door.Matrix | GivenOperator | None = None,
         masses: Any = None,
@@ -86,16 +88,16 @@ class ConeProblem:
         key: np.ndarray | None = None,
         compliance: Array | float = 0.0,
     ):
-        if (G is None) == (N is None):
-            raise ValueError("a cone problem is given by either the map G or the matrix N")
-        self.comm, self.point, self.key = comm, point, key
-        rest = {"G": G, "masses": masses, "point": point, "key": key, "compliance": compliance}
-        contacts = door.contacts_of(comm, r, mu, **rest)
+        data = {"N": N, "G": G, "masses": masses, "point": point, "key": key, "compliance": compliance}
+        contacts = door.contacts_of(comm, r, mu, cones, **data)
         self.units, self._width = contacts.units, contacts.width
         self.r, self.mu, self._given_r = contacts.r, contacts.mu, contacts.given_r
-        self.compliance = compliances(compliance, len(self.r))
-        self.cones = self._cones()
-        self.operator = self._given_operator = door.operator_of(comm, len(self.mu), contacts.width, N, G, masses)
+        self.cones = FrictionCones(self.mu) if cones is None else cones
+        self.comm, self.key = comm, key
+        self.point = None if point is None else np.concatenate([point] * self.cones.parts)
+        self.compliance = np.zeros(self.r.shape)
+        self.compliance[: self.cones.count] = compliances(compliance, self.cones.count)
+        self.operator = self._given_operator = door.operator_of(comm, len(self.r), contacts.width, N, G, masses)
         if self.units is not None:
             self.operator = door.in_units(comm, self._given_operator, self.units)
         self.contact_map = None if isinstance(self.operator, GivenOperator) else self.operator
@@ -116,9 +118,6 @@ class ConeProblem:
     def __repr__(self) -> str:
         given = "N" if self.contact_map is None else "G"
         return f"ConeProblem({self.size} contacts, {self.comm.size} ranks, given by {given})"
-
-    def _cones(self) -> FrictionCones:
-        return FrictionCones(self.mu)
 
     def with_velocities(self, r: Array) -> ConeProblem:
         """The same problem with other velocities r, of the shape of the first ones; it shares all else, and is valid
@@ -250,6 +249,18 @@ class ConeProblem:
         """Arrays of this rank that are equal where contacts, their bodies and all sizes are."""
         key = np.zeros(0) if self.key is None else self.key
         return (key, *self.operator.structure(), np.array([self.size]))
+
+    @cached_property
+    def lowest_curvature(self) -> float:
+        """The least d'Nd / d'd that some Lanczos steps find for impulses d, over the greatest; 0 where N is positive
+        semidefinite by its making. Rounded digits of N make it negative too: -1e-5 with five. Collective."""
+        if self.contact_map is not None:
+            return 0.0
+        free = np.ones_like(self.r)
+        free[self.cones.first_tangents == 0.0, 1:] = 0.0  # what has no friction has no tangential impulses
+        start = free * np.random.default_rng(self.comm.rank).standard_normal(self.r.shape)
+        values = ritz_values(lambda d: free * self.product(d), start, self.sum)
+        return min(values[0] / max(abs(values[0]), abs(values[-1]), TINY), 0.0)
 
     @cached_property
     def all_yield(self) -> bool:

@@ -7,12 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pctt.ccp import auto
+from pctt.ccp.cones import Cones, FrictionCones, RollingCones
 from pctt.ccp.first_order import apgd, faces, gauss_seidel, projected_steps
 from pctt.ccp.first_order.scaled import FirstOrder
 from pctt.ccp.interior import conic, pdip
 from pctt.ccp.result import Result
 
 PRODUCT, MATRIX, NEWTON = "products with N", "rows of N", "Newton systems"
+BOTH = (FrictionCones, RollingCones)
 EITHER = "products with N, or Newton systems"
 
 
@@ -22,9 +24,9 @@ class Solver:
     Newton systems.
 
     ``needs`` is PRODUCT, MATRIX, NEWTON or EITHER; ``iterations`` the default limit (``-ccp_max_it``). A method that
-    ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself; one that ``has_rolling``
-    takes a `pctt.ccp.rolling.RollingProblem`, and one that ``has_multipliers`` can have them as unknowns of its Newton
-    systems (the form `kkt`).
+    ``has_law`` takes ``coulomb=True`` and then finds impulses of Coulomb's law by itself; ``cones`` are
+    the kinds that it takes, and one that ``has_multipliers`` can have them as unknowns of its Newton systems (the form
+    `kkt`).
     """
 
     name: str
@@ -35,7 +37,7 @@ class Solver:
     help: str
     source: str
     has_law: bool = False
-    has_rolling: bool = False
+    cones: tuple[type[Cones], ...] = (FrictionCones,)
     has_multipliers: bool = False
 
     @property
@@ -55,13 +57,12 @@ SOLVERS = {
                "the paper's primal-dual interior point method", "the paper, section 2.4", has_multipliers=True),
         Solver("conic", conic.solve, conic.Conic, NEWTON, 60,
                "symmetric cone interior point method, Nesterov-Todd scaling, Mehrotra's corrector",
-               "Nesterov, Todd 1997; Acary et al. 2023", has_law=True, has_rolling=True),
+               "Nesterov, Todd 1997; Acary et al. 2023", has_law=True, cones=BOTH),
         Solver("auto", auto.solve, auto.Auto, EITHER, 20_000,
                "`apgd` for as many iterations as half of `conic` costs, then `conic`", "`pctt/ccp/auto.py`",
-               has_law=True, has_rolling=True),
+               has_law=True, cones=BOTH),
         Solver("apgd", apgd.solve, apgd.APGD, PRODUCT, 20_000,
-               "accelerated projected gradient descent with restart", "Mazhar et al. 2015", has_law=True,
-               has_rolling=True),
+               "accelerated projected gradient descent with restart", "Mazhar et al. 2015", has_law=True, cones=BOTH),
         Solver("barzilai_borwein", projected_steps.adaptive, projected_steps.BarzilaiBorwein, PRODUCT, 20_000,
                "projected Barzilai-Borwein steps with an adaptive nonmonotone line search", "Dai, Fletcher 2005"),
         Solver("spectral", projected_steps.spectral, projected_steps.BarzilaiBorwein, PRODUCT, 20_000,
@@ -81,13 +82,10 @@ SOLVERS = {
 }  # fmt: skip
 
 
-def why_refused(type: str, rolls: bool) -> str:
-    """In words, why a method cannot take problems with resistance to rolling or spinning, and which methods can; "" if
-    it can."""
-    with_rolling = [name for name, method in SOLVERS.items() if method.has_rolling]
-    if rolls and type not in with_rolling:
-        return f"rolling or spinning resistance; allowed are {', '.join(with_rolling)}"
-    return ""
+def why_refused(type: str, cones: type[Cones]) -> str:
+    """In words, why a method cannot take problems with these cones, and which methods can; "" if it can."""
+    able = [name for name, method in SOLVERS.items() if cones in method.cones]
+    return "" if type in able else f"{cones.what}; allowed are {', '.join(able)}"
 
 
 def why_no_form(type: str, form: str) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, Optional
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array
 from pctt.ccp.problem import Errors
 from pctt.options import FRACTION, number, option
 
@@ -154,7 +154,7 @@ class Result:
     counts : the open, sliding and sticking contacts of all ranks
     beyond : iterations among them after the limits were met, towards the aim beyond these
     asked : what the asked method made of it, where another one had to follow; else None
-    exhausted : whether it has tried the other methods, too
+    exhausted : whether no other method is to be tried
     """
 
     impulse: Array

@@ -14,9 +14,11 @@ from dem.compiled import loop
 from dem.contact_map import find_halo
 from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
-from pctt.ccp.cone import TINY, Array, tangential
+from pctt.ccp.cones import TINY, Array, tangential
 from pctt.ccp.delassus import ColumnMap, sums_of
 from pctt.ccp.problem import ConeProblem
+
+ROUNDED = 1e-4  # of the greatest eigenvalue of N: below it a negative one is of rounded digits, -1e-5 of five
 
 
 def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str:
@@ -36,7 +38,9 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
     if problem.all_yield:
         return ""
     largest = problem.max(_largest(g))
-    parts = _parts(g, problem.r, problem.mu, problem.compliance, problem.diagonal, max(largest, 1e-300))
+    parts = _parts(
+        g, problem.r, problem.cones.first_tangents, problem.compliance, problem.diagonal, max(largest, 1e-300)
+    )
     along, closing, yielding, length, alone = problem.sum(np.array(parts)).tolist()
     size, speed = math.sqrt(length), math.sqrt(closing)
     bound = (along / (1e3 * size * speed)) ** 2 if along < 0 < size * speed else 0.0
@@ -52,10 +56,19 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
     return f"unbounded: impulses grow without limit (norm {size:.1e} N s, {-along / size:.1e} J for each N s more)"
 
 
+def why_indefinite(problem: ConeProblem) -> str:
+    """The reason, in words, if N has a direction of negative curvature beyond rounded digits, so that what a method
+    finds need be no minimum; else "". The first time it takes some products with N. Collective."""
+    lowest = problem.comm.bcast(problem.lowest_curvature)
+    if lowest >= -ROUNDED:
+        return ""
+    return f"N is indefinite: d'Nd / d'd is {lowest:.1g} of the greatest for some impulses d"
+
+
 def why_unanswered(problem: ConeProblem, coulomb: bool) -> str:
     """The reason, in words, if contacts that no impulse moves close, so that the problem is unbounded, or none obeys
     Coulomb's law; else "". For these contacts the test N d = 0, r.d < 0 with d in the cones is exact. Collective."""
-    if not problem.unanswered or len(problem.r) != problem.cones.count:
+    if not problem.unanswered or problem.cones.parts > 1:
         return ""
     slip = tangential(problem.r)
     falls = problem.r[:, 0] - (0.0 if coulomb else problem.mu * slip)

@@ -30,7 +30,7 @@ from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
 from pctt.ccp import fclib
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array
 from pctt.disk import FileError
 from pctt.folder import HARD
 from pctt.options import OptionError

@@ -148,7 +148,7 @@ class Settings(ccp.Limits):
         dt = time_step.recommended(scene) if self.dt is None else self.dt
         delta = time_step.contact_distance(scene) if self.delta is None else self.delta
         resists = scene.pairs(np.inf).resists
-        if why := why_refused(self.solver, resists):
+        if why := why_refused(self.solver, ccp.RollingCones if resists else ccp.FrictionCones):
             raise OptionError(f"-ccp_type {self.solver}: the scene has {why}")
         if resists and self.newton == "contact":
             raise OptionError("-ccp_newton contact: the scene has rolling or spinning resistance; allowed is body")

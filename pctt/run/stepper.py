@@ -24,7 +24,7 @@ from dem.system import ContactSystem, contact_frames
 from dem.together import SceneError
 from dem.world import World
 from pctt import ccp, log
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array, Cones
 from pctt.options import OptionError
 from pctt.run import rest
 from pctt.run.dump import Dump
@@ -262,12 +262,13 @@ class Stepper:
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
-    G, point, key = system.problem_map, system.point, system.key
+    G, point, key, soft = system.problem_map, system.point, system.key, system.compliance
+    r: Array = system.r
+    cones: Cones = ccp.FrictionCones(system.mu)
     if (resists := system.resistance) is not None:
-        r, more = np.concatenate([system.r, resists.velocity]), (resists.rolling, resists.spinning)
-        soft = system.compliance
-        return ccp.RollingProblem(comm, r, system.mu, *more, G=G, point=point, key=key, compliance=soft)
-    return ccp.ConeProblem(comm, system.r, system.mu, G=G, point=point, key=key, compliance=system.compliance)
+        r = np.concatenate([r, resists.velocity])
+        cones = ccp.RollingCones(system.mu, resists.rolling, resists.spinning)
+    return ccp.ConeProblem(comm, r, cones=cones, G=G, point=point, key=key, compliance=soft)
 
 
 def _peak_memory(comm: MPI.Comm) -> int:

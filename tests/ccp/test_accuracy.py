@@ -65,7 +65,7 @@ def test_what_slides_without_pressure_needs_no_impulse(rolls):
         rows = np.concatenate([r, turning])
 
         def made(r: np.ndarray) -> ccp.ConeProblem:
-            return ccp.RollingProblem(SELF, np.concatenate([r, turning]), mu, *more, G=G)
+            return ccp.ConeProblem(SELF, np.concatenate([r, turning]), cones=ccp.RollingCones(mu, *more), G=G)
 
         dual = mu * np.hypot(*slip.T) + more[0] * np.hypot(*turning[:, 1:].T) + more[1] * np.abs(turning[:, 0])
     else:

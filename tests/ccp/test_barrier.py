@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pctt.ccp.interior.pdip import Cone, _matrix
+from pctt.ccp.interior.pdip import PerspectiveConstraint
 
 
 def inside(count: int = 60, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -32,14 +32,14 @@ def derivative(function, g: np.ndarray, step: float = 1e-5) -> np.ndarray:
 
 def test_gradient_and_hessian_are_the_derivatives():
     g, mu = inside()
-    cone = Cone(mu)
+    cone = PerspectiveConstraint(mu)
     assert np.allclose(cone.gradient(g), derivative(cone.value, g), rtol=1e-6, atol=1e-7)
     assert np.allclose(cone.hessian(g), derivative(cone.gradient, g), rtol=1e-6, atol=1e-7)
 
 
 def test_value_is_negative_inside_zero_on_the_surface_positive_outside():
     g, mu = inside()
-    cone = Cone(mu)
+    cone = PerspectiveConstraint(mu)
     assert (cone.value(g) < 0).all()
     rough = mu > 0
     angle = np.random.default_rng(1).uniform(0, 6, len(mu))
@@ -51,12 +51,12 @@ def test_value_is_negative_inside_zero_on_the_surface_positive_outside():
 
 def test_values_are_those_of_the_formulas():
     g, mu = np.array([[2.0, 0.3, -0.4], [2.0, 0.0, 0.0]]), np.array([0.5, 0.0])
-    assert np.allclose(Cone(mu).value(g), [0.5 * (0.125 - 0.5), -2.0])
+    assert np.allclose(PerspectiveConstraint(mu).value(g), [0.5 * (0.125 - 0.5), -2.0])
 
 
 def test_perspective_is_convex_and_of_degree_one():
     g, mu = inside()
-    cone = Cone(mu)
+    cone = PerspectiveConstraint(mu)
     assert np.allclose(cone.value(7 * g), 7 * cone.value(g))
     assert np.allclose((cone.gradient(g) * g).sum(1), cone.value(g))
     assert np.linalg.eigvalsh(cone.hessian(g)).min() > -1e-12
@@ -69,10 +69,10 @@ def test_barrier_blocks_are_symmetric_and_positive_definite_inside(towards_surfa
     g, mu = inside()
     radius = np.maximum(np.hypot(g[:, 1], g[:, 2]), 1e-300)
     g[:, 1:] *= (1 + towards_surface * (0.9999 * mu * g[:, 0] / radius - 1))[:, None]
-    cone = Cone(mu)
+    cone = PerspectiveConstraint(mu)
     f, df = cone.value(g), cone.gradient(g)
     lam = np.random.default_rng(2).uniform(0.1, 2.0, len(mu))
-    blocks = _matrix(cone, cone.hessian(g), df, f, lam, 0.0).schur()
+    blocks = cone.kkt(f, df, cone.hessian(g), lam, 0.0).schur()
     assert np.allclose(blocks, blocks.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(blocks).min() > 0
     rough = mu > 0

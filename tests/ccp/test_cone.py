@@ -7,8 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pctt.ccp import FrictionCones, RollingCones
 from pctt.ccp.accuracy import _nearest_in_cone
-from pctt.ccp.cone import margin, project, step_to_boundary, step_to_zero
+from pctt.ccp.cones.friction import project, step_to_boundary, step_to_zero
+
+
+def margin(x, mu):
+    """How far inside the cone a point is along the tangents."""
+    return mu * x[:, 0] - np.hypot(x[:, 1], x[:, 2])
+
 
 FRICTION = [0.0, 1e-9, 0.01, 0.3, 1.0, 7.0, 1e5]
 
@@ -83,9 +90,29 @@ def test_known_projections(projection):
     assert np.allclose(projection(x, mu), expected, atol=1e-11)
 
 
-def test_margin_is_positive_inside_only():
-    x = np.array([[1.0, 0.0, 0.2], [1.0, 0.3, 0.4], [1.0, 3.0, 4.0]])
-    assert np.allclose(margin(x, np.full(3, 0.5)), [0.3, 0.0, -4.5])
+def test_distances_from_cones():
+    x = np.array([[1.0, 0.0, 0.2], [1.0, 0.3, 0.4], [1.0, 3.0, 4.0], [-2.0, 0.0, 0.0]])
+    found = FrictionCones(np.full(4, 0.5)).distance(x)
+    assert np.allclose(found, [0.0, 0.0, 4.5 / np.sqrt(1.25), 2.0])
+    turned = np.concatenate([x * [1, 0, 0], x[:, [1, 0, 2]] * [1, 0, 1]])  # the same numbers, as rolls
+    rolls = RollingCones(np.full(4, 0.3), np.full(4, 0.5), np.zeros(4))
+    spin = np.abs(turned[4:, 0])
+    turned[4:, 0], turned[4:, 1] = 0.0, spin
+    assert np.allclose(rolls.distance(turned), found)
+
+
+def test_a_step_in_cones_of_discs_ends_where_the_first_disc_does():
+    """The general rule, by Lorentz cones, beside that of friction alone."""
+    rng = np.random.default_rng(0)
+    mu, rho, sigma = rng.uniform(0.1, 1.0, (3, 50))
+    for c in range(50):
+        friction, rolling = mu[c : c + 1], RollingCones(mu[c : c + 1], rho[c : c + 1], sigma[c : c + 1])
+        x, dx = np.array([[1.0, 0, 0], [0, 0, 0]]), rng.normal(size=(2, 3))
+        parts = [(x[:1], dx[:1], friction), (x[:1], np.c_[dx[:1, :1], dx[1:, 1:]], rho[c : c + 1])]
+        parts.append((x[:1], np.array([[dx[0, 0], dx[1, 0], 0.0]]), sigma[c : c + 1]))
+        expected = min(step_to_boundary(*part) for part in parts)
+        assert rolling.step_length(x, dx) == pytest.approx(expected, rel=1e-9)
+        assert FrictionCones(friction).step_length(*parts[0][:2]) == step_to_boundary(*parts[0])
 
 
 # -- steps --------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from several_ranks import alone
 
 from pctt import ccp
 from pctt.ccp import Limits, Status, fclib
-from pctt.ccp.cone import determinant
+from pctt.ccp.cones.lorentz import determinant
 from pctt.ccp.coulomb import Coulomb, fixed_point
 from pctt.ccp.interior import conic
 

@@ -408,3 +408,34 @@ def test_what_is_wrong_on_one_rank_is_refused_on_all():
     ):
         with pytest.raises(ValueError, match=words):
             case.problem(**given)
+
+
+@pytest.mark.parallel(2)
+def test_ranks_that_give_other_kinds_or_fail_alone_end_together():
+    case = Case(comm=MPI.COMM_WORLD)
+    one = case.comm.rank == 1
+    N, G, point = case.N[case.rows], case.G[case.rows], np.zeros((len(case.r[case.own]), 3))
+    whole = mat(case.comm, case.N, case.rows, case.rows)
+    for words, given in (
+        ("N is not given on some ranks, and a matrix on others", {"G": G} if one else {"N": N}),
+        ("N is an object of PETSc on some ranks, and a matrix", {"N": N if one else whole}),
+        ("N is a function or a factor on some ranks, and a matrix", {"N": N if one else ccp.Operator(case.mult, 0)}),
+        ("masses is not given on some", {"G": G} | ({"masses": case.m} if one else {})),
+        ("masses is a matrix on some ranks, and a vector on", {"G": G, "masses": case.M if one else case.m}),
+        ("point is not given", {"G": G, "point": point if one else None}),
+        ("by either the map G or the matrix N .*on rank 1", {} if one else {"N": N}),
+    ):
+        with pytest.raises(ValueError, match=words):
+            case.problem(**given)
+
+    for good in (0, 8):  # it fails as the problem is made, and as it is solved
+        scale = iter([1.0] * good + ["none" if one else 1.0] * 99)
+        failing = ccp.Operator(lambda g, scale=scale: case.mult(g) * next(scale), case.blocks)
+        with pytest.raises(RuntimeError, match=r"N.mult: .*TypeError: .*on rank 1"):
+            ccp.solve(case.problem(N=failing), None, "apgd", LIMITS)
+    with pytest.raises(RuntimeError, match=r"masses: KeyError: 'one' \(on rank 1\)"):
+        case.problem(G=G, masses=lambda b: {}["one"] if one else b)
+    with pytest.raises(RuntimeError, match=r"monitor: KeyError: 'one' \(on rank 1\)"):
+        ccp.solve(case.problem(N=N), monitor=lambda *at: {}["one"] if one else None)
+    with pytest.raises(ValueError, match=r"a guess of no numbers.*on rank 1"):
+        ccp.solve(case.problem(N=N), "none" if one else None)

@@ -171,7 +171,7 @@ def rolling_spheres(path: Path) -> tuple[Path, np.ndarray]:
 @pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("solver", ["apgd", "conic"])
 def test_a_problem_with_rolling_is_read_and_solved(tmp_path, solver):
-    """The frames of all ranks' contacts, in the rows of `pctt.ccp.RollingProblem`: forces, then spin and rolls."""
+    """The frames of all ranks' contacts, in the rows of `pctt.ccp.RollingCones`: forces, then spin and rolls."""
     comm = MPI.COMM_WORLD
     path = tmp_path / "rolling.hdf5"
     if comm.rank == 0:

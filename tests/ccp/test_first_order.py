@@ -12,13 +12,18 @@ from problems import SELF, from_graph, from_matrix, heap
 from dem.contact_map import find_halo
 from pctt import ccp
 from pctt.ccp import Limits
-from pctt.ccp.cone import margin, project
+from pctt.ccp.cones.friction import project
 from pctt.ccp.first_order import apgd, gauss_seidel, projected_steps
 from pctt.ccp.first_order.faces import Face
 from pctt.ccp.first_order.scaled import Progress, ScaledProblem
 
 METHODS = [name for name, solver in ccp.SOLVERS.items() if not solver.newton]
 EVERY = pytest.mark.parametrize("method", METHODS)
+
+
+def margin(x, mu):
+    """How far inside the cone a point is along the tangents."""
+    return mu * x[:, 0] - np.hypot(x[:, 1], x[:, 2])
 
 
 def objective(problem: ccp.ConeProblem, g: np.ndarray) -> float:

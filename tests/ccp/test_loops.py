@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from pctt.ccp import cone
-from pctt.ccp.interior.lorentz import LorentzCones
-from pctt.ccp.rolling import RollingCones
+from pctt.ccp import FrictionCones, RollingCones
+from pctt.ccp.cones import friction as cone
+from pctt.ccp.cones import lorentz as algebra
 
 COUNTS = [0, 1, 7, 256, 1000]  # also of whole strips, and not
 
@@ -51,6 +51,23 @@ def inside(rng, count):
     x = rng.normal(size=(count, 3))
     x[:, 0] = np.hypot(x[:, 1], x[:, 2]) * (1 + 10.0 ** rng.uniform(-6, 1, count)) + 1e-3
     return x
+
+
+class Scaling:
+    """Products with the W of `scaling` and its inverse, by their definition."""
+
+    def __init__(self, s, z):
+        self.parts = self.root, self.eta = algebra.scaling(s, z)
+
+    def times(self, x):
+        return self.eta[:, None] * self.by(self.root, x)
+
+    def divide(self, x):
+        return self.by(self.root * [1, -1, -1], x) / self.eta[:, None]
+
+    @staticmethod
+    def by(root, x):
+        return 2 * root * (root * x).sum(axis=1, keepdims=True) - x * [1, -1, -1]
 
 
 class Sample:
@@ -119,7 +136,7 @@ def test_a_number_that_is_none_stays_none(name):
 def test_sums_of_a_problem_from_its_cones():
     x, y = np.random.default_rng(0).normal(size=(2, 4, 3))
     mu = np.array([0.5, 0.0, 0.3, 2.0])
-    cones = cone.FrictionCones(mu)
+    cones = FrictionCones(mu)
     term = np.stack([mu * np.hypot(y[:, 1], y[:, 2]), 0 * mu, 0 * mu], axis=1)
     for coulomb, target in ((False, x - 0.3 * y), (True, x - 0.3 * (y + term))):
         np.testing.assert_allclose(cones.move(x, y, 0.3, coulomb), nearest(target, mu) - x, atol=1e-14)
@@ -127,7 +144,7 @@ def test_sums_of_a_problem_from_its_cones():
             np.testing.assert_allclose(one, other)
     open_ones = (x[:, 0] <= 0) & (y[:, 0] - term[:, 0] > 0.1)
     assert np.array_equal(cones.not_idle(x, x, y, 0.1), ~open_ones)
-    sums, most = cone.FrictionCones(np.zeros(0)).errors(x[:0], y[:0], x[:0], 0.3, True)
+    sums, most = FrictionCones(np.zeros(0)).errors(x[:0], y[:0], x[:0], 0.3, True)
     assert most == 0.0
     assert not sums.any()
 
@@ -136,7 +153,7 @@ def test_the_scaling_is_that_of_nesterov_and_todd():
     rng = np.random.default_rng(0)
     s, z = inside(rng, 200), inside(rng, 200)
     s[:5, 1:] = z[:5, 1:] = 0.0
-    W = cone.NesterovTodd(*cone.scaling(s, z))
+    W = Scaling(s, z)
     np.testing.assert_allclose(W.times(z), W.divide(s), rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(W.divide(W.times(s)), s, rtol=1e-7, atol=1e-9)
 
@@ -150,8 +167,8 @@ def test_blocks_of_cones_that_share_a_normal_number(rolls, coulomb, normal, tang
     W^-2."""
     rng, count = np.random.default_rng(0), 60
     mu = rng.uniform(0.05, 1.5, (3, count)) * (rng.random((3, count)) > 0.2)
-    cones = RollingCones(np.concatenate(mu[:2]), mu[2]) if rolls else cone.FrictionCones(mu[0])
-    lorentz = LorentzCones(cones)
+    cones = RollingCones(*mu) if rolls else FrictionCones(mu[0])
+    lorentz = cones.lorentz()
     rows = len(lorentz.known)
     A = np.stack([lorentz.of(e.reshape(rows, 3)).ravel() for e in np.eye(3 * rows)], axis=1)
     known = np.diag(lorentz.known.ravel())
@@ -166,7 +183,7 @@ def test_blocks_of_cones_that_share_a_normal_number(rolls, coulomb, normal, tang
     u = np.zeros_like(s)
     if coulomb:
         u[:, 1:] = z[:, 1:] / np.maximum(np.hypot(z[:, 1], z[:, 2]), 1e-300)[:, None]
-    W = cone.NesterovTodd(*cone.scaling(s, z))
+    W = Scaling(s, z)
     inverse = np.stack([W.divide(W.divide(np.tile(e, (len(s), 1)))) for e in np.eye(3)], axis=2)
     turned = inverse.copy()
     turned[:, 0] -= np.einsum("cj,cjk->ck", u, inverse)
@@ -179,8 +196,8 @@ def test_blocks_of_cones_that_share_a_normal_number(rolls, coulomb, normal, tang
     C[:count] = np.stack([soft, along[0], along[0]], axis=1)
     if rolls:
         C[count:] = np.stack([along[2], along[1], along[1]], axis=1)
-    arrows = lorentz.arrows(*W, u, soft, along.ravel())
-    barriers = lorentz.barriers(*W, u, 1.0, np.zeros((count, lorentz.width)))
+    arrows = lorentz.arrows(*W.parts, u, soft, along.ravel())
+    barriers = lorentz.barriers(*W.parts, u, 1.0, np.zeros((count, lorentz.width)))
 
     def whole(blocks):
         """The matrix of blocks, in rows."""
@@ -213,7 +230,7 @@ def test_pairs_on_the_central_path():
     rng = np.random.default_rng(0)
     x, tau = rng.normal(size=(100, 3)), rng.uniform(0.1, 2.0, 100)
     x[:3], x[3:6, 1:] = 0.0, 0.0
-    s, z = cone.central_pair(x, tau, 1e-6)
+    s, z = algebra.central_pair(x, tau, 1e-6)
     np.testing.assert_allclose(s - tau[:, None] * z, x, atol=1e-14)
     np.testing.assert_allclose(jordan_product(s, z), np.tile([1e-6, 0, 0], (100, 1)), atol=1e-14)
 
@@ -230,22 +247,22 @@ def test_right_hand_sides_of_a_step_by_their_definitions(slides):
     s, z = inside(rng, 100), inside(rng, 100)
     w, ds, dz = rng.normal(size=(3, 100, 3))
     u = slides * rng.normal(size=(100, 3)) * [0, 1, 1]
-    W = cone.NesterovTodd(*cone.scaling(s, z))
-    c, f = cone.pulls(*W, s, z, u, w)
+    W = Scaling(s, z)
+    c, f = algebra.pulls(*W.parts, s, z, u, w)
     expected = W.divide(w) - z
     expected[:, 0] -= (u * expected).sum(axis=1)
     np.testing.assert_allclose(c, expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(f, W.times(w) - s, rtol=1e-9, atol=1e-9)
     change = W.divide(W.divide(ds))
     change[:, 0] -= (u * change).sum(axis=1)
-    np.testing.assert_allclose(cone.less_inverse_squares(*W, u, w, ds), w - change, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(algebra.less_inverse_squares(*W.parts, u, w, ds), w - change, rtol=1e-9, atol=1e-9)
 
     aim = [0.3, 0, 0] - jordan_product(W.divide(ds), W.times(dz))
-    centred = jordan_product(W.times(z), cone.centring(*W, z, ds, dz, 0.3))
+    centred = jordan_product(W.times(z), algebra.centring(*W.parts, z, ds, dz, 0.3))
     np.testing.assert_allclose(centred, aim, rtol=1e-6, atol=1e-6)
     after = jordan_product(W.times(z) + 0.5 * W.divide(ds), W.times(z) + 0.5 * W.times(dz))
     low, high = 0.1, 1.0
-    moved = after + jordan_product(W.times(z), cone.towards_path(*W, z, ds, dz, 0.5, low, high))
+    moved = after + jordan_product(W.times(z), algebra.towards_path(*W.parts, z, ds, dz, 0.5, low, high))
     for x, sign in ((moved, 1.0), (moved, -1.0)):
         length = np.hypot(after[:, 1], after[:, 2])
         along = (x * after)[:, 1:].sum(axis=1) / np.maximum(length, 1e-300)  # the directions stay

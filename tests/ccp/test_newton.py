@@ -12,7 +12,8 @@ from problems import SELF, dense_of, from_graph, from_matrix, heap, matrix, part
 from scipy.linalg import block_diag
 
 from pctt import ccp
-from pctt.ccp import delassus
+from pctt.ccp import delassus, newton_for
+from pctt.ccp.interior.pdip import PDIP
 from pctt.ccp.newton import few as elimination
 from pctt.ccp.newton.few import Factors, ordered
 from pctt.ccp.newton.forms import BodyForm, ContactForm
@@ -361,3 +362,12 @@ def test_factors_say_where_they_fail_and_take_what_is_indefinite(symmetric, leas
     order = ordered(N.indptr, N.indices, 100, 2)
     assert Factors(N, order, np.ones((2, 3, 3)), symmetric).solve(np.arange(6.0).reshape(2, 3), 1e-9)[1] == 0
     assert Factors(N, order, np.tile(-4.0 * np.eye(3), (2, 1, 1)), symmetric).solve(np.ones((2, 3)), 1e-9)[1] > 0
+
+
+def test_systems_with_multipliers_go_from_one_constraint_of_a_contact_to_two_and_back():
+    newton, problem = newton_for(SELF, "pdip", "kkt"), from_graph(*heap(bodies=30))
+    for form in ("perspective", "paper", "perspective"):
+        found = ccp.solve(problem, None, "pdip", ccp.Limits(1e-6), PDIP(form=form), newton, ccp.RELAXATION)
+        assert found.converged, found.reason
+        assert found.solver == "pdip"
+    newton.destroy()

@@ -6,7 +6,7 @@ from mpi4py import MPI
 from scipy.optimize import minimize_scalar
 
 from pctt import ccp
-from pctt.ccp import rolling
+from pctt.ccp.cones import rolling
 from tests.ccp.problems import SELF
 from tests.ccp.problems import part as part_of
 
@@ -27,7 +27,7 @@ def test_projection_on_the_product_of_discs():
         x = rng.standard_normal(6) * [2.0, 1, 1, 1, 1, 1]
         mu, rho, sigma = rng.uniform(0.05, 1.5, 3) * [1.0, case % 3 > 0, case % 2]
         sigma, rho = max(sigma, 1e-7), max(rho, 1e-7)
-        out = rolling.project_to(x.reshape(2, 3).copy(), np.array([mu, rho]), np.array([sigma]), np.zeros((2, 3)))
+        out = rolling.project_to(x.reshape(2, 3).copy(), *np.array([[mu], [rho], [sigma]]), np.zeros((2, 3)))
         found = out.ravel()
         assert found[0] == pytest.approx(height_by_search(x, mu, rho, sigma), abs=1e-6)
         sizes = np.hypot(found[1], found[2]), np.hypot(found[4], found[5]), abs(found[3])
@@ -47,7 +47,7 @@ def test_five_cases_of_friction_and_rolling():
         (1.0, 0.1, 2.0, (1 + rho * 2) / (1 + rho**2)), (1.0, 2.0, 2.0, (1 + mu * 2 + rho * 2) / (1 + mu**2 + rho**2)),
     ):  # fmt: skip
         x = np.array([[n, t, 0], [0, 0, m]])
-        out = rolling.project_to(x, np.array([mu, rho]), np.zeros(1), np.zeros((2, 3)))
+        out = rolling.project_to(x, *np.array([[mu], [rho], [0.0]]), np.zeros((2, 3)))
         assert out[0, 0] == pytest.approx(height, abs=1e-15)
 
 
@@ -64,7 +64,7 @@ def test_solutions_meet_the_law(law):
     rng = np.random.default_rng(1)
     G, r = blocks(rng, 6, 8), rng.standard_normal((12, 3)) - [1, 0, 0]
     mu, rho, sigma = rng.uniform(0.2, 0.6, (3, 6))
-    problem = ccp.RollingProblem(SELF, r, mu, rho, sigma, G=G)
+    problem = ccp.ConeProblem(SELF, r, cones=ccp.RollingCones(mu, rho, sigma), G=G)
     limits = ccp.Limits(1e-8, closing_work=np.inf)
     found = ccp.solve(problem, None, "auto", limits, law=law)
     assert found.converged
@@ -85,8 +85,8 @@ def test_solutions_meet_the_law(law):
         ccp.solve(problem, None, "pdip", law=ccp.RELAXATION)
     with pytest.raises(ValueError, match="allowed is body"):
         ccp.solve(problem, None, "conic", newton=ccp.newton_for(SELF, "conic", "contact"), law=ccp.RELAXATION)
-    with pytest.raises(ValueError, match="one for each of 6 contacts"):
-        ccp.RollingProblem(SELF, r, mu, rho[1:], sigma, G=G)
+    with pytest.raises(ValueError, match=r"rolling has the shape \(5,\); allowed is \(6,\)"):
+        ccp.ConeProblem(SELF, r, cones=ccp.RollingCones(mu, rho[1:], sigma), G=G)
 
 
 def test_without_resistance_it_is_the_problem_of_friction():
@@ -94,7 +94,8 @@ def test_without_resistance_it_is_the_problem_of_friction():
     G, r = blocks(rng, 5, 7), rng.standard_normal((10, 3)) - [1, 0, 0]
     mu, none = np.full(5, 0.4), np.zeros(5)
     limits = ccp.Limits(1e-9, closing_work=np.inf)
-    with_moments = ccp.solve(ccp.RollingProblem(SELF, r, mu, none, none, G=G), None, "apgd", limits, law=ccp.RELAXATION)
+    smooth = ccp.ConeProblem(SELF, r, cones=ccp.RollingCones(mu, none, none), G=G)
+    with_moments = ccp.solve(smooth, None, "apgd", limits, law=ccp.RELAXATION)
     plain = ccp.BlockRows(G.indptr[:6], G.indices[:10], G.blocks[:10], 7)
     alone = ccp.solve(ccp.ConeProblem(SELF, r[:5], mu, G=plain), None, "apgd", limits, law=ccp.RELAXATION)
     np.testing.assert_allclose(with_moments.impulse[:5], alone.impulse, atol=1e-6)
@@ -109,7 +110,7 @@ def test_conic_agrees_with_apgd(law, contacts, bodies):
     G, r = blocks(rng, contacts, bodies), rng.standard_normal((2 * contacts, 3)) - [1, 0, 0]
     some = rng.uniform(0.05, 0.6, (3, contacts)) * (np.arange(3)[:, None] != np.arange(contacts) % 9)
     soft = np.where(np.arange(contacts) % 2, 0.05, 0.0)[:, None] * [1.0, 3.5]
-    problem = ccp.RollingProblem(SELF, r, *some, G=G, compliance=soft)
+    problem = ccp.ConeProblem(SELF, r, cones=ccp.RollingCones(*some), G=G, compliance=soft)
     limits = ccp.Limits(1e-10, closing_work=np.inf, fallback=False)
     one, other = (ccp.solve(problem, None, name, limits, law=law) for name in ("conic", "apgd"))
     assert one.converged, one.reason
@@ -127,12 +128,12 @@ def test_conic_finds_the_impulse_of_a_contact_alone():
     r, some = rng.standard_normal((2 * count, 3)), rng.uniform(0.1, 1.0, (3, count))
     rows = 2 * count
     G = ccp.BlockRows(np.arange(rows + 1), np.arange(rows), np.tile(np.eye(3, 6), (rows, 1, 1)), rows)
-    problem = ccp.RollingProblem(SELF, r, *some, G=G)
+    problem = ccp.ConeProblem(SELF, r, cones=ccp.RollingCones(*some), G=G)
     found = ccp.solve(
         problem, None, "conic", ccp.Limits(1e-10, closing_work=np.inf, fallback=False), law=ccp.RELAXATION
     )
     assert found.converged, found.reason
-    exact = rolling.project_to(-r, np.concatenate(some[:2]), some[2], np.zeros_like(r))
+    exact = rolling.project_to(-r, *some, np.zeros_like(r))
     np.testing.assert_allclose(found.impulse, exact, atol=1e-9)
 
 
@@ -144,13 +145,13 @@ def test_conic_does_not_depend_on_the_ranks(law):
     G, r = blocks(rng, count, bodies), rng.standard_normal((2 * count, 3)) - [1, 0, 0]
     some = rng.uniform(0.1, 0.6, (3, count))
     limits = ccp.Limits(1e-9, closing_work=np.inf, fallback=False)
-    alone = ccp.solve(ccp.RollingProblem(SELF, r, *some, G=G), None, "conic", limits, law=law)
+    alone = ccp.solve(ccp.ConeProblem(SELF, r, cones=ccp.RollingCones(*some), G=G), None, "conic", limits, law=law)
     here = part_of(comm, count)
     rows = np.r_[here, count + np.arange(count)[here]]
     near = np.concatenate([2 * rows[:, None] + [0, 1]], axis=1).ravel()
     own = part_of(comm, bodies)
     mine = ccp.BlockRows(2 * np.arange(len(rows) + 1), G.indices[near], G.blocks[near], own.stop - own.start)
-    problem = ccp.RollingProblem(comm, r[rows], *some[:, here], G=mine)
+    problem = ccp.ConeProblem(comm, r[rows], cones=ccp.RollingCones(*some[:, here]), G=mine)
     found = ccp.solve(problem, None, "conic", limits, law=law)
     assert found.converged, found.reason
     np.testing.assert_allclose(found.impulse, alone.impulse[rows], atol=1e-6)

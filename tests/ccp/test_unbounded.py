@@ -9,6 +9,7 @@ from problems import SELF, from_graph, from_matrix, heap, matrix
 
 from pctt import ccp
 from pctt.ccp import BlockRows, Limits, Status
+from pctt.ccp.cones.friction import project
 from pctt.ccp.unbounded import why_unbounded
 
 SOLVERS = pytest.mark.parametrize("solver", ["conic", "pdip", "apgd", "auto"])
@@ -93,7 +94,7 @@ def test_problems_with_a_solution_are_never_named(seed):
     problem = from_graph(known, graph)
     rng = np.random.default_rng(seed)
     for size in (1e-3, 1.0, 1e3, 1e9):
-        g = ccp.cone.project(known.g + size * rng.normal(size=known.g.shape), known.mu)
+        g = project(known.g + size * rng.normal(size=known.g.shape), known.mu)
         assert why_unbounded(problem, g) == ""
 
 
@@ -216,7 +217,39 @@ def test_an_indefinite_N_is_a_status(solver, law):
         result = ccp.solve(ccp.ConeProblem(SELF, rng.normal(size=(4, 3)), np.full(4, 0.5), N=N), type=solver, law=law)
         assert isinstance(result.status, Status)
         assert np.isfinite(result.impulse).all()
+        assert not result.converged, result.reason
     N = np.eye(6)
     N[0, 0] = -1.0
     result = ccp.solve(ccp.ConeProblem(SELF, -np.ones((2, 3)), np.full(2, 0.5), N=N), type=solver, law=law)
     assert result.status in (Status.UNBOUNDED, Status.BREAKDOWN), result.reason
+
+
+@pytest.mark.parametrize("given", ["matrix", "operator", "masses"])
+@pytest.mark.parametrize("solver", ["auto", "pdip", "gauss_seidel"])
+def test_no_solver_converges_silently_where_N_is_indefinite(solver, given):
+    """Its one negative direction is of a contact that opens: no iterate meets it."""
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(90, 40))
+    N = A @ A.T
+    r = rng.normal(size=(30, 3)) - [0.5, 0, 0]
+    r[4] = [50.0, 0, 0]
+    free = ccp.solve(ccp.ConeProblem(SELF, r, np.full(30, 0.4), N=N), type="conic", law=ccp.RELAXATION)
+    assert free.converged
+    assert free.states[4] == 0
+    N[12:15] = N[:, 12:15] = 0.0
+    N[[12, 13, 14], [12, 13, 14]] = [100.0, 100.0, -1.0]
+    if given == "operator":
+        if solver == "gauss_seidel":
+            return
+        N = ccp.Operator(lambda g: (dense @ g.ravel()).reshape(-1, 3), np.array(diagonal(dense := N)))
+    made = {"N": N} if given != "masses" else {"G": np.eye(90), "masses": lambda b: N @ b}
+    result = ccp.solve(ccp.ConeProblem(SELF, r, np.full(30, 0.4), **made), type=solver, law=ccp.RELAXATION)
+    assert result.status is Status.BREAKDOWN
+    assert "N is indefinite" in result.reason
+    if given == "matrix":  # without friction nothing moves along the tangents
+        smooth = ccp.ConeProblem(SELF, r, np.where(np.arange(30) == 4, 0.0, 0.4), **made)
+        assert ccp.solve(smooth, type=solver, law=ccp.RELAXATION).converged
+
+
+def diagonal(N):
+    return [N[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] for c in range(len(N) // 3)]

@@ -22,8 +22,8 @@ from mpi4py import MPI
 
 from dem.contact_map import Halo, find_halo
 from dem.exchange import offsets
-from pctt.ccp import cone
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array
+from pctt.ccp.cones.friction import project
 from pctt.ccp.delassus import HUB, rows_in_blocks
 from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
@@ -84,7 +84,7 @@ class Sweep:
         x = spread(self._halo, x)
         for own, rows, steps, b, mu in self._colours:
             y = (rows @ x.ravel()).reshape(-1, 3) + b
-            x[own] = cone.project(x[own] - steps * y, mu)
+            x[own] = project(x[own] - steps * y, mu)
             self._halo.update(x)
         return x[: self._halo.own]
 

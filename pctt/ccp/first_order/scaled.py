@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dem.compiled import loop
 from dem.contact_map import ContactMap
-from pctt.ccp.cone import Array, FrictionCones
+from pctt.ccp.cones import Array, Cones
 from pctt.ccp.delassus import GivenOperator
 from pctt.ccp.problem import ConeProblem, Errors
 from pctt.ccp.result import Limits, Result, Status
@@ -39,7 +39,7 @@ class Awake(NamedTuple):
 
     rows: Rows | None  #: (n,) of the arrays (nc, 3); None: all
     operator: ContactMap | GivenOperator
-    cones: FrictionCones
+    cones: Cones
     b: Array  #: (n, 3)
     compliance: Array  #: (n, 3), or no row for zero
 

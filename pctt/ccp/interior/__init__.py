@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.ccp.cone import TINY, Array
+from pctt.ccp.cones import TINY, Array
 from pctt.ccp.problem import ConeProblem
 
 INDEFINITE = "N is not positive semidefinite: a step has negative curvature"

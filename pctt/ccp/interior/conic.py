@@ -1,8 +1,8 @@
 """Symmetric cone interior point method: Nesterov-Todd scaling, Mehrotra's predictor and corrector.
 
 In the variables s = (mu g_n, g_t) and z = (y_n / mu, y_t) all cones are the same and self-dual. A contact that resists
-rolling and spinning has three such pairs, with one g_n, and y_n is what their z sum to (`lorentz.py`): s = A g and
-y = A'z. The method follows the central path s o z = t e of
+rolling and spinning has three such pairs, with one g_n, and y_n is what their z sum to: s = A g and y = A'z
+(`pctt.ccp.cones.lorentz`). The method follows the central path s o z = t e of
 
     v = G' g,    y = G v + C g + r,    s and z in the cones, s'z = 0,
 
@@ -33,10 +33,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp import cone
-from pctt.ccp.cone import Array, NesterovTodd, dot, scaling
+from pctt.ccp.cones import TINY, Array, dot, lorentz, tangential
+from pctt.ccp.cones.friction import step_to_zero
+from pctt.ccp.cones.lorentz import Arrows, NesterovTodd
 from pctt.ccp.interior import useful_part
-from pctt.ccp.interior.lorentz import Arrows, LorentzCones
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem, Errors
 from pctt.ccp.result import Limits, Result, Status
@@ -72,11 +72,11 @@ def solve(
     if coulomb and not newton.takes_any:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
-    cones = Cones(problem, options, coulomb, newton.system.mends)
-    at, history, waited, least, last_gap = cones.start(guess), list[float](), 0, np.inf, np.inf
+    conic = ConicProblem(problem, options, coulomb, newton.system.mends)
+    at, history, waited, least, last_gap = conic.start(guess), list[float](), 0, np.inf, np.inf
     while True:
         # residuals
-        found, gap = cones.residuals(at), problem.dot(at.s, at.z)
+        found, gap = conic.residuals(at), problem.dot(at.s, at.z)
         history.append(limits.residual(found.errors))
         limits.tell(len(history) - 1, history[-1])
         unbounded = bool(why_unbounded(given, found.g, found.y))
@@ -88,13 +88,13 @@ def solve(
         if done or len(history) > limits.max_it or waited > options.patience:
             break
         # scaling
-        scaled = cones.scaled(at, found)
+        scaled = conic.scaled(at, found)
         newton.update(*scaled.blocks(), symmetric=not coulomb)
         # affine step
         with phase("ConicPredictor"):
             affine = scaled.direction(newton, np.zeros_like(at.z))
         # centring: the further the affine step may go, the less (Mehrotra)
-        target = max((1.0 - min(1.0, scaled.reach(affine))) ** 3, options.least) * gap / cones.count
+        target = max((1.0 - min(1.0, scaled.reach(affine))) ** 3, options.least) * gap / conic.count
         with phase("ConicCorrector"):
             # combined step, with the second-order term of the affine one
             w = scaled.centred(affine, target)
@@ -107,7 +107,7 @@ def solve(
                 step, direction = max((step, direction), (scaled.step(other), other), key=lambda pair: pair[0])
         # update
         if step > 0:
-            at = cones.moved(at, direction, step)
+            at = conic.moved(at, direction, step)
     iterations = len(history) - 1
     status, words = Status.STALLED, f"stalled after {iterations} iterations"
     if min(history) <= limits.tol:
@@ -147,7 +147,7 @@ class Direction(NamedTuple):
     x: Array
 
 
-class Cones:
+class ConicProblem:
     """The problem in its Lorentz cones: s = A g, y = A'z.
 
     mends : whether Newton systems mend what an inexact solve leaves
@@ -157,50 +157,50 @@ class Cones:
 
     def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool, mends: bool):
         self.problem, self.options, self.coulomb, self.mends = problem, options, coulomb, mends
-        self.lorentz = LorentzCones(problem.cones)
-        self.count = problem.size * self.lorentz.number  # of Lorentz cones on all ranks
+        self.form = problem.cones.lorentz()
+        self.count = problem.size * self.form.number  # of Lorentz cones on all ranks
         self.proximal = options.proximal * problem.mean_diagonal
-        self.compliance = problem.compliance[: self.lorentz.count, 0] + self.proximal * (self.lorentz.weight**2).sum(0)
-        self.tangential = np.full(self.lorentz.weight.size, self.proximal)
-        self.tangential[: self.lorentz.count] += problem.compliance[: self.lorentz.count, 1]
-        self.within = np.full((self.lorentz.count, self.lorentz.width), self.proximal)
-        self.within[:, 0] = self.proximal * (self.lorentz.weight**2).sum(0)
+        self.compliance = problem.compliance[: self.form.count, 0] + self.proximal * (self.form.weight**2).sum(0)
+        self.tangential = np.full(self.form.weight.size, self.proximal)
+        self.tangential[: self.form.count] += problem.compliance[: self.form.count, 1]
+        self.within = np.full((self.form.count, self.form.width), self.proximal)
+        self.within[:, 0] = self.proximal * (self.form.weight**2).sum(0)
         self.boundary = options.boundary_with_law if coulomb else options.boundary
         forcing = options.forcing_with_law if coulomb else options.forcing
         self.forcing = forcing if mends else options.forcing_of_impulses
-        self._still = np.zeros((self.lorentz.weight.size, 3))
+        self._still = np.zeros((self.form.weight.size, 3))
 
     def start(self, guess: Array) -> Point:
         """A pair on the central path near the guess: s - tau z = s_0 - tau z_0. Where cones share a normal impulse all
         get the greatest one."""
-        problem, lorentz = self.problem, self.lorentz
-        guess = useful_part(problem, guess) * lorentz.known
-        y = (problem.product(guess) + problem.r) * lorentz.known
-        diagonal = lorentz.of(problem.diagonal)
-        diagonal[:, 0] /= lorentz.weight.ravel() ** 3
+        problem, form = self.problem, self.form
+        guess = useful_part(problem, guess) * form.known
+        y = (problem.product(guess) + problem.r) * form.known
+        diagonal = form.of(problem.diagonal)
+        diagonal[:, 0] /= form.weight.ravel() ** 3
         tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
         amount = self.options.start * problem.dot(problem.r, problem.r) / problem.size / problem.mean_diagonal
-        z = lorentz.spread(y)
-        s, z = cone.central_pair(lorentz.of(guess) - tau[:, None] * z, tau, amount)
-        g = lorentz.impulses(s)
-        return Point(lorentz.of(g), z, problem.momentum(g))
+        z = form.spread(y)
+        s, z = lorentz.central_pair(form.of(guess) - tau[:, None] * z, tau, amount)
+        g = form.impulses(s)
+        return Point(form.of(g), z, problem.momentum(g))
 
     def residuals(self, at: Point) -> Residuals:
-        problem, lorentz = self.problem, self.lorentz
-        g = lorentz.impulses(at.s)
+        problem, form = self.problem, self.form
+        g = form.impulses(at.s)
         momentum = problem.momentum(g)
         rest = problem.compliance * g + problem.r
-        y = (problem.velocity_of(momentum) + rest) * lorentz.known
-        r_y = (problem.velocity_of(at.v) + rest) * lorentz.known
-        r_y -= lorentz.back(without_de_saxce(at.z) if self.coulomb else at.z)
+        y = (problem.velocity_of(momentum) + rest) * form.known
+        r_y = (problem.velocity_of(at.v) + rest) * form.known
+        r_y -= form.back(without_de_saxce(at.z) if self.coulomb else at.z)
         return Residuals(g, y, problem.errors(g, y, self.coulomb), at.v - momentum, r_y)
 
     def scaled(self, at: Point, found: Residuals) -> Scaled:
         """The linear equations of an iterate."""
         with phase("CCPBarrier"):
-            W = NesterovTodd(*scaling(at.s, at.z))
+            W = NesterovTodd(*lorentz.scaling(at.s, at.z))
             u = sliding_directions(at.z) if self.coulomb else self._still
-            arrows = self.lorentz.arrows(*W, u, self.compliance, self.tangential) if self.mends else None
+            arrows = self.form.arrows(*W, u, self.compliance, self.tangential) if self.mends else None
         # the velocities that the natural residual stands for
         shown = found.errors.natural * self.problem.norm(found.g) * self.problem.mean_diagonal
         return Scaled(self, at, found, W, u, arrows, self.forcing * shown)
@@ -221,7 +221,7 @@ class Scaled(NamedTuple):
     tol : residual to which Newton systems are solved [m/s]
     """
 
-    cones: Cones
+    conic: ConicProblem
     at: Point
     found: Residuals
     W: NesterovTodd
@@ -233,26 +233,26 @@ class Scaled(NamedTuple):
         """What `Newton.update` takes: the blocks B, with the compliance that problems do not have, or (B + C)^-1."""
         if self.arrows is not None:
             return None, self.arrows.X
-        return self.cones.lorentz.barriers(*self.W, self.u, self.cones.problem.mean_diagonal, self.cones.within), None
+        return self.conic.form.barriers(*self.W, self.u, self.conic.problem.mean_diagonal, self.conic.within), None
 
     def direction(self, newton: Newton, w: Array, *earlier: Array) -> Direction:
         """The direction of the right-hand side w; ``earlier``: solutions of the Newton system to begin from."""
-        problem, lorentz, found = self.cones.problem, self.cones.lorentz, self.found
-        c, f = cone.pulls(*self.W, self.at.s, self.at.z, self.u, w)
-        q = lorentz.back(c) - found.r_y
+        problem, form, found = self.conic.problem, self.conic.form, self.found
+        c, f = lorentz.pulls(*self.W, self.at.s, self.at.z, self.u, w)
+        q = form.back(c) - found.r_y
         alone = None if self.arrows is None else self.arrows.alone(f, found.r_y)
         dg, x = newton.solve(q, self.tol, found.r_v, earlier, alone)
-        dv, ds = newton.system.momenta(x, dg, found.r_v), lorentz.of(dg)
+        dv, ds = newton.system.momenta(x, dg, found.r_v), form.of(dg)
         if self.arrows is not None:  # r_y vanishes, r_v takes the error of the linear solve
             dy = problem.velocity_of(dv) + problem.compliance * dg + found.r_y
             dy = self.arrows.split(dy, f, ds)
         else:  # r_v vanishes, r_y takes it
-            dy = cone.less_inverse_squares(*self.W, self.u, c, ds)
+            dy = lorentz.less_inverse_squares(*self.W, self.u, c, ds)
         return Direction(ds, self._turned(dy), dy, dv, x)
 
     def _turned(self, dy: Array) -> Array:
         """T dy, the change of z to first order."""
-        if not self.cones.coulomb:
+        if not self.conic.coulomb:
             return dy
         dz = dy.copy()
         dz[:, 0] += dot(self.u, dy)
@@ -260,41 +260,41 @@ class Scaled(NamedTuple):
 
     def reach(self, d: Direction) -> float:
         """Longest step that keeps both in the cones of all ranks; 0 where a direction is no number."""
-        problem, at = self.cones.problem, self.at
-        if not self.cones.coulomb:
-            return problem.min(min(cone.step_inside(at.s, d.ds), cone.step_inside(at.z, d.dz)))
-        of_z = cone.step_to_zero(without_de_saxce(at.z)[:, 0], d.dy[:, 0])
-        longest = problem.min(min(cone.step_inside(at.s, d.ds), of_z))
+        problem, at = self.conic.problem, self.at
+        if not self.conic.coulomb:
+            return problem.min(min(lorentz.step_inside(at.s, d.ds), lorentz.step_inside(at.z, d.dz)))
+        of_z = step_to_zero(without_de_saxce(at.z)[:, 0], d.dy[:, 0])
+        longest = problem.min(min(lorentz.step_inside(at.s, d.ds), of_z))
         return longest if np.isfinite(problem.sum(float(d.dz.sum()))) else 0.0
 
     def step(self, d: Direction) -> float:
         """The step to take, at most 1 and not up to the boundary."""
-        return min(1.0, self.cones.boundary * self.reach(d))
+        return min(1.0, self.conic.boundary * self.reach(d))
 
     def centred(self, d: Direction, target: float) -> Array:
         """The w of a direction that aims at s o z = target e, with the second-order term of the last direction."""
-        return cone.centring(*self.W, self.at.z, d.ds, d.dz, target)
+        return lorentz.centring(*self.W, self.at.z, d.ds, d.dz, target)
 
     def towards_path(self, d: Direction, reach: float, target: float) -> Array:
         """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target, up
         to the factor ``spread``.
 
         Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
-        spread = self.cones.options.spread
-        return cone.towards_path(*self.W, self.at.z, d.ds, d.dz, reach, 1.0 / spread * target, spread * target)
+        spread = self.conic.options.spread
+        return lorentz.towards_path(*self.W, self.at.z, d.ds, d.dz, reach, 1.0 / spread * target, spread * target)
 
 
 def with_de_saxce(y: Array) -> Array:
     """(y_n + |y_t|, y_t) of scaled velocities y (nc, 3): inside the cones if y_n > 0."""
     z = y.copy()
-    z[:, 0] += cone.tangential(y)
+    z[:, 0] += tangential(y)
     return z
 
 
 def without_de_saxce(z: Array) -> Array:
     """The y (nc, 3) that z is of, `with_de_saxce`."""
     y = z.copy()
-    y[:, 0] = cone.determinant(z) / (z[:, 0] + cone.tangential(z))
+    y[:, 0] = lorentz.determinant(z) / (z[:, 0] + tangential(z))
     return y
 
 
@@ -302,4 +302,4 @@ def sliding_directions(z: Array) -> Array:
     """The directions (nc, 3) in which contacts with scaled velocities z slide; zero without sliding."""
     u = z.copy()
     u[:, 0] = 0.0
-    return u / np.maximum(cone.tangential(z), cone.TINY)[:, None]
+    return u / np.maximum(tangential(z), TINY)[:, None]

@@ -22,7 +22,8 @@ from typing import NamedTuple, Optional
 
 import numpy as np
 
-from pctt.ccp.cone import Array, dot, step_to_boundary, step_to_zero, times
+from pctt.ccp.cones import Array, dot
+from pctt.ccp.cones.friction import step_to_zero, times
 from pctt.ccp.interior import INDEFINITE, hold, is_indefinite, paper, useful_part, velocity
 from pctt.ccp.newton import Newton
 from pctt.ccp.newton.kkt import KKT
@@ -64,7 +65,7 @@ class PDIP:
 
 
 @dataclass(frozen=True)
-class Cone:
+class PerspectiveConstraint:
     """The friction cones as constraints f(g) <= 0, with first and second derivatives inside: the perspective form
     f = 1/2 (|g_t|^2 / g_n - mu^2 g_n), convex and of degree one. Its gradient stays away from zero.
 
@@ -99,24 +100,25 @@ class Cone:
         H[self.frictionless] = 0.0
         return H
 
+    def kkt(self, f: Array, df: Array, hessian: Array, lam: Array, proximal: float) -> KKT:
+        """What the constraints, with these values, derivatives and multipliers, and a term ``proximal`` I add to N."""
+        M = lam[:, None, None] * hessian
+        M[:, [0, 1, 2], [0, 1, 2]] += proximal
+        hold(M, self.frictionless, lam / -f)
+        return KKT(M, df[:, None], f[:, None], lam[:, None])
+
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, newton: Newton) -> Result:
     """Impulses; ``guess`` (nc, 3) gives the normal impulses of persistent contacts, 0 elsewhere."""
     if options.form == PAPER:
         return paper.solve(problem, guess, limits, newton, options.centering or 0.1, options.boundary or 0.99)
-    centering, boundary = options.centering or 0.3, options.boundary or 0.9
-    cone = Cone(problem.mu)
     newton.begin(problem)
-    linear = newton.linear
-    g, lam = _start(problem, guess, cone, options)
-    history: list[float] = []
-    earlier: deque[Array] = deque(maxlen=3)
-    step, damping = 1.0, 0.0
-    last_g, last_y = g, velocity(problem, g)
+    barrier = BarrierProblem(problem, options)
+    at, history, step, damping = barrier.start(guess), list[float](), 1.0, 0.0
+    last, earlier = at, deque[Array](maxlen=3)
     for iteration in range(limits.max_it + 1):
         # residuals
-        y = velocity(problem, g)
-        errors = problem.errors(g, y)
+        errors = problem.errors(at.g, at.y)
         history.append(limits.residual(errors))
         limits.tell(iteration, history[-1])
         if history[-1] <= limits.tol:
@@ -125,57 +127,146 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         if iteration == limits.max_it:
             status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
             break
-        if is_indefinite(problem, g - last_g, y - last_y):
+        if is_indefinite(problem, at.g - last.g, at.y - last.y):
             status, reason = Status.BREAKDOWN, INDEFINITE
             break
-        last_g, last_y = g, y
         # linearisation
-        f, df, hessian = cone.value(g), cone.gradient(g), cone.hessian(g)
-        aim = centering * problem.sum(-(lam @ f)) / problem.size  # 1/t
         damping = _next_damping(damping, step, errors.natural, options)
-        kkt = _matrix(cone, hessian, df, f, lam, damping * errors.natural * problem.mean_diagonal)
-        newton.linearise(kkt)
-        at = Linearised(problem, newton, cone, g, lam, y, f, df, hessian, earlier)
-        # Newton step. The residual of a solve is a velocity. It must be only a part of those that the natural residual
-        # stands for: otherwise complementarity would fall without them, and near the boundary no step makes up for that
-        r_g, r_lam = _right_side(at, aim)
-        shown = errors.natural * problem.norm(g) * problem.mean_diagonal
-        tol = min(options.rtol * problem.norm(kkt.reduced(r_g, r_lam)), options.forcing * shown)
-        dg, dlam = _direction(at, r_g, r_lam, tol)
-        step = _step_length(at, dg, dlam, boundary, options)
+        linear = barrier.linearised(at, errors.natural, damping, newton, earlier)
+        # Newton step
+        direction = linear.direction()
+        step = linear.step(direction)
         # corrected step, where the cones' curvature cuts Newton's short and the other is much longer
         if step < options.short:
-            curved, missed = _bend(at, dg, dlam, min(1.0, step + options.reach))
-            r_g, r_lam = _right_side(at, aim + missed)
-            other_dg, other_dlam = _direction(at, r_g - curved, r_lam, tol)
-            other = _step_length(at, other_dg, other_dlam, boundary, options)
-            if other > options.longer * step:
-                step, dg, dlam = other, other_dg, other_dlam
+            other = linear.corrected(direction, min(1.0, step + options.reach))
+            longer = linear.step(other)
+            if longer > options.longer * step:
+                step, direction = longer, other
         if not step > options.least:
             status, reason = Status.STALLED, "steps became too short"
             if step != step:
                 status, reason = Status.BREAKDOWN, "not a number in the Newton step"
             break
         # update
-        g = g + step * dg
-        lam = lam + step * dlam
-    return Result(g, status, reason, history[-1], iteration, linear.iterations, linear.fallbacks, history)
+        last, at = at, barrier.moved(at, direction, step)
+    counts = newton.linear.iterations, newton.linear.fallbacks
+    return Result(at.g, status, reason, history[-1], iteration, *counts, history)
+
+
+class Point(NamedTuple):
+    """An iterate: impulses inside the cones, their velocities, and the multipliers."""
+
+    g: Array
+    y: Array
+    lam: Array
+
+
+class Direction(NamedTuple):
+    """A change of a `Point`."""
+
+    dg: Array
+    dlam: Array
+
+
+class BarrierProblem:
+    """The cone problem with a constraint, and a multiplier, for each contact."""
+
+    def __init__(self, problem: ConeProblem, options: PDIP):
+        self.problem, self.options = problem, options
+        self.constraint = PerspectiveConstraint(problem.mu)
+        self.centering, self.boundary = options.centering or 0.3, options.boundary or 0.9
+
+    def start(self, guess: Array) -> Point:
+        """Impulses on the cones' axes and multipliers of equal complementarity."""
+        problem = self.problem
+        closing = problem.norm(velocity(problem, np.zeros_like(problem.r))) / np.sqrt(problem.size)
+        new = self.options.start * closing / problem.mean_diagonal
+        known = useful_part(problem, guess)[:, 0]
+        g = np.zeros_like(problem.r)
+        g[:, 0] = np.where(known > 0, np.maximum(known, 0.1 * new), new)
+        y = velocity(problem, g)
+        speed = problem.norm(y) / np.sqrt(problem.size)
+        mean_normal = problem.sum(g[:, 0].sum()) / problem.size
+        mean_mu = problem.sum(problem.mu.sum()) / problem.size
+        return Point(g, y, 3 * speed * mean_normal * (mean_mu or 1.0) / -self.constraint.value(g))
+
+    def linearised(
+        self, at: Point, natural: float, damping: float, newton: Newton, earlier: deque[Array]
+    ) -> Linearised:
+        """The linear equations of an iterate with this natural residual; ``earlier`` solutions are where their solves
+        begin."""
+        problem, constraint = self.problem, self.constraint
+        f, df, hessian = constraint.value(at.g), constraint.gradient(at.g), constraint.hessian(at.g)
+        aim = self.centering * problem.sum(-(at.lam @ f)) / problem.size  # 1/t
+        with phase("CCPBarrier"):
+            kkt = constraint.kkt(f, df, hessian, at.lam, damping * natural * problem.mean_diagonal)
+        newton.linearise(kkt)
+        # The residual of a solve is a velocity. It must be only a part of those that the natural residual stands for:
+        # otherwise complementarity would fall without them, and near the boundary no step makes up for that
+        r_g, r_lam = -(at.y + at.lam[:, None] * df), (at.lam * f + aim)[:, None]
+        shown = natural * problem.norm(at.g) * problem.mean_diagonal
+        tol = min(self.options.rtol * problem.norm(kkt.reduced(r_g, r_lam)), self.options.forcing * shown)
+        return Linearised(self, at, newton, f, df, hessian, aim, r_g, tol, earlier)
+
+    def moved(self, at: Point, d: Direction, step: float) -> Point:
+        """The point after a step."""
+        g = at.g + step * d.dg
+        return Point(g, velocity(self.problem, g), at.lam + step * d.dlam)
 
 
 class Linearised(NamedTuple):
-    """The data that all directions of a Newton step share: the problem, impulses and multipliers, velocities, the
-    constraints with their first and second derivatives, and the last solutions of Newton systems."""
+    """An iteration's linear equations, which all its directions share.
 
-    problem: ConeProblem
+    at : the iterate
+    f, df, hessian : the constraints there, and their first and second derivatives
+    aim : the complementarity 1/t
+    r_g : the first part of -r_t (nc, 3)
+    tol : residual to which Newton systems are solved [m/s]
+    earlier : the last solutions of Newton systems
+    """
+
+    barrier: BarrierProblem
+    at: Point
     newton: Newton
-    cone: Cone
-    g: Array
-    lam: Array
-    y: Array
     f: Array
     df: Array
     hessian: Array
+    aim: float
+    r_g: Array
+    tol: float
     earlier: deque[Array]
+
+    def direction(self, curved: Array | float = 0.0, missed: Array | float = 0.0) -> Direction:
+        """The direction for the right-hand side less ``curved`` (nc, 3), and ``missed`` (nc,) more complementarity."""
+        r_lam = (self.at.lam * self.f + (self.aim + missed))[:, None]
+        dg, dlam, x = self.newton.step(self.r_g - curved, r_lam, self.tol, earlier=self.earlier)
+        self.earlier.append(x)
+        dg[self.barrier.constraint.frictionless, 1:] = 0.0
+        return Direction(dg, dlam[:, 0])
+
+    def corrected(self, d: Direction, reach: float) -> Direction:
+        """The direction with the terms that the linearised conditions lack at ``reach`` along another one, divided by
+        ``reach``: those of second order of sum lambda_i grad f_i (without third derivatives) and of lambda_i f_i. A
+        contact that slides has to turn its impulse along the cone, and straight steps leave it soon."""
+        turned = times(self.hessian, d.dg)
+        missed = d.dlam * dot(self.df, d.dg) + 0.5 * self.at.lam * dot(d.dg, turned)
+        return self.direction(reach * d.dlam[:, None] * turned, reach * missed)
+
+    def step(self, d: Direction) -> float:
+        """Longest step, at most 1, inside the cones, near the central path; nan if the direction is no number."""
+        problem, options, value = self.barrier.problem, self.barrier.options, self.barrier.constraint.value
+        g, lam = self.at.g, self.at.lam
+        if not np.isfinite(problem.sum(d.dg.sum() + d.dlam.sum())):
+            return np.nan
+        longest = problem.min(min(problem.cones.step_length(g, d.dg), step_to_zero(lam, d.dlam)))
+        step = min(1.0, self.barrier.boundary * longest)
+        while step > options.least:
+            gap = -(lam + step * d.dlam) * value(g + step * d.dg)
+            mean = problem.sum(gap.sum()) / problem.size
+            if problem.min(gap.min(initial=np.inf)) >= options.neighbourhood * mean:
+                break
+            step *= options.back
+        return step
 
 
 def _next_damping(damping: float, step: float, natural: float, options: PDIP) -> float:
@@ -189,62 +280,3 @@ def _next_damping(damping: float, step: float, natural: float, options: PDIP) ->
     if step < 0.3:
         return min(max(1.0, 4.0 * damping), 4.0)
     return damping / 4.0 if step > 0.7 else damping
-
-
-def _right_side(at: Linearised, aim: Array | float) -> tuple[Array, Array]:
-    """-r_t, the two parts (nc, 3) and (nc, 1), for the complementarity ``aim`` = 1/t, of all contacts or of each."""
-    return -(at.y + at.lam[:, None] * at.df), (at.lam * at.f + aim)[:, None]
-
-
-def _direction(at: Linearised, r_g: Array, r_lam: Array, tol: float) -> tuple[Array, Array]:
-    """dg and dlam for a right-hand side."""
-    dg, dlam, x = at.newton.step(r_g, r_lam, tol, earlier=at.earlier)
-    at.earlier.append(x)
-    dg[at.cone.frictionless, 1:] = 0.0
-    return dg, dlam[:, 0]
-
-
-def _bend(at: Linearised, dg: Array, dlam: Array, reach: float) -> tuple[Array, Array]:
-    """The terms that the linearised conditions lack at ``reach`` along a direction, divided by ``reach``: those of
-    second order of sum lambda_i grad f_i (without third derivatives) and of lambda_i f_i. A contact that slides has to
-    turn its impulse along the cone, and straight steps leave it soon."""
-    turned = times(at.hessian, dg)
-    missed = dlam * dot(at.df, dg) + 0.5 * at.lam * dot(dg, turned)
-    return reach * dlam[:, None] * turned, reach * missed
-
-
-def _start(problem: ConeProblem, guess: Array, cone: Cone, options: PDIP) -> tuple[Array, Array]:
-    """Impulses on the cones' axes and multipliers of equal complementarity."""
-    closing = problem.norm(velocity(problem, np.zeros_like(problem.r))) / np.sqrt(problem.size)
-    new = options.start * closing / problem.mean_diagonal
-    known = useful_part(problem, guess)[:, 0]
-    g = np.zeros_like(problem.r)
-    g[:, 0] = np.where(known > 0, np.maximum(known, 0.1 * new), new)
-    speed = problem.norm(velocity(problem, g)) / np.sqrt(problem.size)
-    mean_normal = problem.sum(g[:, 0].sum()) / problem.size
-    mean_mu = problem.sum(problem.mu.sum()) / problem.size
-    return g, 3 * speed * mean_normal * (mean_mu or 1.0) / -cone.value(g)
-
-
-def _matrix(cone: Cone, hessian: Array, df: Array, f: Array, lam: Array, proximal: float) -> KKT:
-    """lambda hess f + rho I, the gradients and the rest of the Newton matrix."""
-    with phase("CCPBarrier"):
-        M = lam[:, None, None] * hessian
-        M[:, [0, 1, 2], [0, 1, 2]] += proximal
-        hold(M, cone.frictionless, lam / -f)
-        return KKT(M, df[:, None], f[:, None], lam[:, None])
-
-
-def _step_length(at: Linearised, dg: Array, dlam: Array, boundary: float, options: PDIP) -> float:
-    """Longest step, at most 1, inside the cones, near the central path; nan if the direction is no number."""
-    problem, cone, g, lam = at.problem, at.cone, at.g, at.lam
-    if not np.isfinite(problem.sum(dg.sum() + dlam.sum())):
-        return np.nan
-    step = min(1.0, boundary * problem.min(min(step_to_boundary(g, dg, cone.mu), step_to_zero(lam, dlam))))
-    while step > options.least:
-        gap = -(lam + step * dlam) * cone.value(g + step * dg)
-        mean = problem.sum(gap.sum()) / problem.size
-        if problem.min(gap.min(initial=np.inf)) >= options.neighbourhood * mean:
-            break
-        step *= options.back
-    return step

@@ -23,7 +23,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.ccp.cone import TINY, Array
+from pctt.ccp.cones import TINY, Array
 from pctt.ccp.delassus import GivenMatrix, all_blocks
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.few import Order, ordered
@@ -122,7 +122,7 @@ class Newton:
     def _few(self, problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:
         """N and an order of elimination, if the contacts are few; that of the last problem is kept."""
         if self._looked[0] is not problem.operator:
-            few = self.takes_few and problem.comm.size == 1 and len(problem.r) == problem.cones.count <= Settings.few
+            few = self.takes_few and problem.comm.size == problem.cones.parts == 1 and problem.size <= Settings.few
             self._looked = (problem.operator, _eliminated(problem) if few else None)
         return self._looked[1]
 
@@ -166,6 +166,10 @@ class Newton:
         """Set the Newton matrix of a method with constraints and multipliers. Forms other than `kkt` eliminate them."""
         self._kkt = kkt
         if isinstance(self.system, KKTForm):
+            if self.system.constraints not in (0, kkt.f.shape[1]):  # those of another method
+                structure = self._structure
+                self.forget()
+                self.system, self._structure = KKTForm(self.problem), structure
             with phase("CCPUpdate"):
                 self.system.linearise(kkt)
                 self.linear.new_matrix(self.system)

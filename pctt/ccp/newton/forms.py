@@ -23,7 +23,7 @@ from petsc4py import PETSc
 from dem.contact_map.loops import local_product, pack
 from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.body_matrix import BodyOperator, inverse_blocks
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array
 from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.few import Factors, Order
 from pctt.ccp.newton.fronts import Dissection, Fronts

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 
 from pctt.blocks import new_matrix, set_diagonal_blocks, symmetric_shell
-from pctt.ccp.cone import Array
+from pctt.ccp.cones import Array
 from pctt.ccp.delassus import rows_in_blocks
 from pctt.ccp.newton.forms import ContactForm
 from pctt.ccp.problem import ConeProblem
@@ -58,6 +58,7 @@ class KKTForm(ContactForm):
     def __init__(self, problem: ConeProblem):
         super().__init__(problem)
         self.symmetric = False
+        self.constraints = 0  # of a contact, of the present matrix
 
     @cached_property
     def matrix(self) -> PETSc.Mat:
@@ -67,6 +68,7 @@ class KKTForm(ContactForm):
     def linearise(self, kkt: KKT) -> None:
         """Make the matrix."""
         nc, k = kkt.f.shape
+        self.constraints = k
         self.size = np.sqrt(np.square(kkt.df).sum(axis=2))
         along = kkt.df / self.size[:, :, None]
         self.row = self.size / -kkt.f

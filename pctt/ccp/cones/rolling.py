@@ -17,66 +17,51 @@ Arrays of contacts are (2 nc, 3): (normal, tangents) of all contacts, then (spin
 from __future__ import annotations
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from dem.compiled import inlined, loop
-from dem.contact_map import BlockRows, ContactMap
-from dem.exchange import refuse
-from pctt.ccp.cone import (
+from pctt.ccp.cones.base import Array, Cones, floats, tangential
+from pctt.ccp.cones.friction import (
     NO_MOVE,
     ONE,
     STRIP,
     ZERO,
-    Array,
-    FrictionCones,
     add_compliance,
     add_products,
     add_squares,
     add_work,
     extrapolate,
-    tangential,
 )
-from pctt.ccp.problem import ConeProblem, compliances
 
 
-class RollingCones(FrictionCones):
-    """The cones of contacts with coefficients ``mu`` (2 count,), of friction and of rolling, and ``spinning``."""
+class RollingCones(Cones):
+    """The cones of contacts with coefficients (count,): of friction ``mu``, and of ``rolling`` and ``spinning``, which
+    are lengths over those of the contacts."""
 
-    tangents = ((1, 2), (4, 5), (3,))
+    tangents, what = ((1, 2), (4, 5), (3,)), "rolling or spinning resistance"
 
-    def __init__(self, mu: Array, spinning: Array):
-        self.mu, self.spinning, self.count = mu, spinning, len(spinning)
+    def __init__(self, mu: Array, rolling: Array, spinning: Array):
+        self.mu, self.rolling, self.spinning = (floats(each) for each in (mu, rolling, spinning))
+        self.count = len(self.mu)
+
+    def named(self) -> list[tuple[str, Array]]:
+        return [("mu", self.mu), ("rolling", self.rolling), ("spinning", self.spinning)]
 
     @property
     def coefficients(self) -> Array:
-        return np.stack([self.mu[: self.count], self.mu[self.count :], self.spinning])
-
-    def joined(self, x: Array) -> Array:
-        return np.concatenate([x[: self.count], x[self.count :]], axis=1)
-
-    def rows(self, x: Array) -> Array:
-        return np.concatenate([x[:, :3], x[:, 3:]])
-
-    def times(self, blocks: Array, x: Array) -> Array:
-        return self.rows(np.einsum("cij,cj->ci", blocks, self.joined(x)))
+        return np.stack([self.mu, self.rolling, self.spinning])
 
     def scaled(self, size: Array, precision: type[np.floating]) -> RollingCones:
-        """The cones of unknowns multiplied by ``size`` (2 count, 3): spin and rolls have sizes of their own, so that
-        discs stay discs."""
-        normal = size[: self.count, 0]
-        mu = self.mu * size[:, 1] / np.concatenate([normal, normal])
-        spinning = self.spinning * size[self.count :, 0] / normal
-        return RollingCones(mu.astype(precision, copy=False), spinning.astype(precision, copy=False))
-
-    def rows_of(self, contacts: NDArray[np.intp]) -> NDArray[np.intp]:
-        return np.concatenate([contacts, self.count + contacts])
+        """Spin and rolls have sizes of their own, so that discs stay discs."""
+        forces, moments = np.split(size, 2)
+        sizes = (self.mu, forces[:, 1]), (self.rolling, moments[:, 1]), (self.spinning, moments[:, 0])
+        return RollingCones(*((each * along / forces[:, 0]).astype(precision, copy=False) for each, along in sizes))
 
     def only(self, contacts: NDArray[np.intp]) -> RollingCones:
-        return RollingCones(self.mu[self.rows_of(contacts)], self.spinning[contacts])
+        return RollingCones(self.mu[contacts], self.rolling[contacts], self.spinning[contacts])
 
     def project(self, x: Array, out: Array) -> Array:
-        return project_to(x, self.mu, self.spinning, out)
+        return project_to(x, self.mu, self.rolling, self.spinning, out)
 
     @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
     def errors(
@@ -92,40 +77,15 @@ class RollingCones(FrictionCones):
         sums = np.array([move[~(move <= NO_MOVE * speed)].sum(), np.vdot(g, g), *works])
         return sums, float(closing.max(initial=0.0))
 
-    def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
-        x, last_x, opening = x[: self.count, 0], last_x[: self.count, 0], y[: self.count, 0] - self.resisted(y)
-        return (x > 0) | (last_x > 0) | ~(opening > least)
-
-    def resisted(self, y: Array) -> Array:
-        slides, rolls = (self.mu * tangential(y)).reshape(2, -1)
-        return slides + rolls + self.spinning * np.abs(y[self.count :, 0])
+    def de_saxce(self, y: Array) -> Array:
+        forces, moments = np.split(y, 2)
+        return self.mu * tangential(forces) + self.rolling * tangential(moments) + self.spinning * np.abs(moments[:, 0])
 
     def accelerated_step(
         self, x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, coulomb: bool, out: Array
     ) -> tuple[float, float, float]:
-        return accelerated_step(x, last_x, y, compliance, beta, step, self.mu, self.spinning, float(coulomb), out)
-
-
-class RollingProblem(ConeProblem):
-    """A `ConeProblem` whose ``mu`` (2 nc,) has the coefficients of friction, then those of rolling over the lengths of
-    the contacts, as ``spinning`` (nc,) has them of spinning."""
-
-    def __init__(
-        self, comm: MPI.Comm, r: Array, mu: Array, rolling: Array, spinning: Array, *, G: ContactMap | BlockRows,
-        point: Array | None = None, key: np.ndarray | None = None, compliance: Array | float = 0.0,
-    ):  # fmt: skip
-        """r (2 nc, 3); the others as of a `ConeProblem`, with a row for each contact."""
-        nc = len(mu)
-        fits = np.shape(rolling) == np.shape(spinning) == (nc,) and (np.asarray(spinning) >= 0.0).all()
-        refuse(comm, "" if fits else f"rolling or spinning: allowed are numbers >= 0, one for each of {nc} contacts")
-        self.spinning = np.ascontiguousarray(spinning, dtype=float)
-        twice = None if point is None else np.concatenate([point, point])
-        soft = np.concatenate([compliances(compliance, nc)[:, :2], np.zeros((nc, 2))])
-        super().__init__(comm, r, np.concatenate([mu, rolling]), G=G, point=twice, compliance=soft)
-        self.key = key
-
-    def _cones(self) -> RollingCones:
-        return RollingCones(self.mu, self.spinning)
+        given = x, last_x, y, compliance, beta, step, self.mu, self.rolling, self.spinning
+        return accelerated_step(*given, float(coulomb), out)
 
 
 @inlined
@@ -166,13 +126,13 @@ def size_of(x, y):
 
 
 @loop
-def project_to(x: Array, mu: Array, sigma: Array, out: Array) -> Array:
+def project_to(x: Array, mu: Array, rho: Array, sigma: Array, out: Array) -> Array:
     """The nearest points (2 nc, 3) of the cones, into ``out``, which may be x."""
     count = len(sigma)
     for c in range(count):
         d = count + c
         tangential, roll, spin = size_of(x[c, 1], x[c, 2]), size_of(x[d, 1], x[d, 2]), abs(x[d, 0])
-        n, t, r, s = nearest(x[c, 0], tangential, roll, spin, mu[c], mu[d], sigma[c])
+        n, t, r, s = nearest(x[c, 0], tangential, roll, spin, mu[c], rho[c], sigma[c])
         out[c, 0], out[c, 1], out[c, 2] = n, t * x[c, 1], t * x[c, 2]
         out[d, 0], out[d, 1], out[d, 2] = s * x[d, 0], r * x[d, 1], r * x[d, 2]
     return out
@@ -180,10 +140,10 @@ def project_to(x: Array, mu: Array, sigma: Array, out: Array) -> Array:
 
 @loop
 def accelerated_step(
-    x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, sigma: Array,
-    de_saxce: float, out: Array,
+    x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, rho: Array,
+    sigma: Array, de_saxce: float, out: Array,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """`pctt.ccp.cone.accelerated_step` for these cones, of which both halves of the rows go through strips."""
+    """`pctt.ccp.cones.friction.accelerated_step` for these cones: both halves of the rows go through strips."""
     count, soft = len(sigma), len(compliance) > 0
     part, way, saxce = x.dtype.type(beta), x.dtype.type(step), x.dtype.type(de_saxce)
     x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
@@ -192,7 +152,7 @@ def accelerated_step(
     work = np.zeros(3 * STRIP, x.dtype)
     for first in range(0, count, STRIP):
         here = sigma[first : first + STRIP]
-        friction, rolling = mu[first : first + len(here)], mu[count + first : count + first + len(here)]
+        friction, rolling = mu[first : first + len(here)], rho[first : first + len(here)]
         a, b = 3 * first, 3 * (first + len(here))
         d, e = a + 3 * count, b + 3 * count
         extrapolate(x[a:b], last_x[a:b], part, z)

@@ -16,6 +16,9 @@ of positive numbers, in which nothing cancels however near the boundary a pair i
 
 Source: Acary and Bourrier (2021) for the cone. The method of Siconos for friction and rolling, which also has a Lorentz
 cone for each, keeps the parts of y_n as unknowns of its systems; here impulses are the only ones.
+
+Each Lorentz cone x_0 >= |x_1:| is its own dual, with the Jordan product x o y = (x'y, x_0 y_1: + y_0 x_1:). Its unit is
+e = (1, 0, 0), the spectral values of x are x_0 +- |x_1:|. Source: Domahidi, Chu and Boyd (2013).
 """
 
 from __future__ import annotations
@@ -23,14 +26,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dem.compiled import loop
-from pctt.ccp.cone import Array, FrictionCones
+from dem.compiled import inlined, loop
 
+Array = NDArray[np.float64]
+TINY = float(np.finfo(float).tiny)
+LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
 ROUND = 1e-14  # tangential part of a unit scaling point below which it has no direction
 
 
-class LorentzCones:
+class LorentzForm:
     """Of k Lorentz cones for each of ``count`` contacts; arrays of them are (k count, 3), all first ones first.
 
     weight : (k, count) mu, rho, sigma; 1 where they are zero
@@ -38,15 +44,15 @@ class LorentzCones:
     known : (rows, 3) the same of the numbers of impulses, of which a contact has 3 in each part of ``count`` rows
     """
 
-    def __init__(self, cones: FrictionCones):
-        self.cones, coefficient = cones, cones.coefficients
+    def __init__(self, coefficient: Array, tangents: tuple[tuple[int, ...], ...]):
+        """``coefficient`` (k, count); ``tangents``: of each cone, the numbers of a contact beside the first."""
         self.number, self.count = coefficient.shape
         self.weight = np.where(coefficient > 0, coefficient, 1.0)
         self.live = (coefficient > 0).astype(float)
-        self.width = 1 + sum(map(len, cones.tangents))
+        self.width = 1 + sum(map(len, tangents))
         self.rows = self.count * self.width // 3
         #: (k, 2) of the tangential numbers among those of a contact; -1: there is none
-        self.place = np.array([[*where, -1][:2] for where in cones.tangents])
+        self.place = np.array([[*where, -1][:2] for where in tangents])
         self.known = self.back(np.ones((coefficient.size, 3)))
         self.known[: self.count, 0] = 1.0
 
@@ -71,7 +77,7 @@ class LorentzCones:
         return z
 
     def arrows(self, root: Array, size: Array, u: Array, normal: Array, tangential: Array) -> Arrows:
-        """Of scalings ``root``, ``size`` (`pctt.ccp.cone.scaling`) and directions of sliding ``u`` (k count, 3), zero
+        """Of scalings ``root``, ``size`` (`scaling`) and directions of sliding ``u`` (k count, 3), zero
         without Coulomb's law, where C is ``normal`` (count,) and, in tangential numbers, ``tangential`` (k count,)."""
         shape = (self.count, self.width, self.width)
         given = self.weight.ravel(), self.live.ravel(), self.place, normal, tangential
@@ -86,11 +92,21 @@ class LorentzCones:
         return B
 
 
+def joined(x: Array, parts: int) -> Array:
+    """The numbers (count, 3 parts) of each contact, of rows (parts count, 3)."""
+    return x if parts == 1 else np.concatenate(np.split(x, parts), axis=1)
+
+
+def rows(x: Array, parts: int) -> Array:
+    """The rows (parts count, 3) of the numbers (count, 3 parts) of each contact."""
+    return x if parts == 1 else np.concatenate(np.split(x, parts, axis=1))
+
+
 class Arrows(NamedTuple):
     """X (count, width, width) and its parts. Of each cone: ``right`` and ``left`` (k count, 2), D (k count, 3), the
     ``part`` (k count,) of sigma (count,); and ``rise`` (k count,) and ``turn`` (k count, 2), see `split`."""
 
-    lorentz: LorentzCones
+    lorentz: LorentzForm
     tangential: Array
     X: Array
     right: Array
@@ -117,11 +133,11 @@ class Arrows(NamedTuple):
     def alone(self, f: Array, r: Array) -> Array:
         """X (A' T^-1 W^-2 f - r) (rows, 3) of f (k count, 3) and r (rows, 3), without a product with W^-2, which would
         drown in rounding: late in an iteration it has eigenvalues that differ by 1e18."""
-        lorentz, cones = self.lorentz, self.lorentz.cones
+        lorentz, parts_of = self.lorentz, self.lorentz.width // 3
         out = np.zeros((lorentz.count, lorentz.width))
         parts = self.right, self.left, self.D, self.part, self.sigma
-        _alone(f, cones.joined(r), lorentz.weight.ravel(), lorentz.place, self.tangential, *parts, out)
-        return cones.rows(out)
+        _alone(f, joined(r, parts_of), lorentz.weight.ravel(), lorentz.place, self.tangential, *parts, out)
+        return rows(out, parts_of)
 
 
 @loop
@@ -250,3 +266,194 @@ def _barriers(root, size, u, weight, live, place, least, more, B):
                 B[c, m, m] = 1e12 * max(B[c, 0, 0], least)
         for m in range(B.shape[1]):
             B[c, m, m] += more[c, m]
+
+
+# -- algebra of one Lorentz cone ------------------------------------------------------------------------------
+
+
+class NesterovTodd(NamedTuple):
+    """The scaling W = eta (2 root root' - J), J = diag(1, -1, -1), of pairs: ``root`` (nc, 3), ``eta`` (nc,).
+
+    Products by this form. Those by blocks lose a digit of the residual that the conic method reaches."""
+
+    root: Array
+    eta: Array
+
+
+@loop
+def scaling(s: Array, z: Array) -> tuple[Array, Array]:
+    """The Nesterov-Todd scaling W of pairs (s, z) inside the cones x_0 >= |x_1:|, the symmetric W with W z = W^-1 s:
+    its unit hyperbolic vector (nc, 3) and size eta (nc,), see `NesterovTodd`.
+
+    W has the eigenvalues eta (w_0 + |w_1:|), eta / (w_0 + |w_1:|) and eta for (1, u), (1, -u) and (0, u'), where u is
+    the direction of the unit scaling point w. Source: Nesterov and Todd (1997); Andersen, Roos and Terlaky (2003)."""
+    root, size = np.empty((len(s), 3)), np.empty(len(s))
+    for c in range(len(s)):
+        size_s = np.sqrt(_determinant(s[c, 0], s[c, 1], s[c, 2]))
+        size_z = np.sqrt(_determinant(z[c, 0], z[c, 1], z[c, 2]))
+        cosine = (s[c, 0] * z[c, 0] + s[c, 1] * z[c, 1] + s[c, 2] * z[c, 2]) / (size_s * size_z)
+        angle = 0.5 * (1.0 + cosine)
+        angle = np.sqrt(0.5 if angle < 0.5 else angle)
+        of_s, of_z = 0.5 / (angle * size_s), 0.5 / (angle * size_z)
+        first, size[c] = of_s * s[c, 0] + of_z * z[c, 0], np.sqrt(size_s / size_z)
+        length = np.sqrt(2.0 * (1.0 + first))
+        root[c, 0] = (1.0 + first) / length
+        root[c, 1] = (of_s * s[c, 1] - of_z * z[c, 1]) / length
+        root[c, 2] = (of_s * s[c, 2] - of_z * z[c, 2]) / length
+    return root, size
+
+
+@loop
+def pulls(root: Array, size: Array, s: Array, z: Array, u: Array, w: Array) -> tuple[Array, Array]:
+    """T^-1 (W^-1 w - z) and W w - s (nc, 3); u (nc, 3) is the direction of sliding in T = 1 + e u'."""
+    out, other = np.empty(s.shape), np.empty(s.shape)
+    for c in range(len(s)):
+        n, t_1, t_2 = _scaled(root, size, c, w, True)
+        n, t_1, t_2 = n - z[c, 0], t_1 - z[c, 1], t_2 - z[c, 2]
+        out[c, 0], out[c, 1], out[c, 2] = n - (u[c, 1] * t_1 + u[c, 2] * t_2), t_1, t_2
+        n, t_1, t_2 = _scaled(root, size, c, w, False)
+        other[c, 0], other[c, 1], other[c, 2] = n - s[c, 0], t_1 - s[c, 1], t_2 - s[c, 2]
+    return out, other
+
+
+@loop
+def less_inverse_squares(root: Array, size: Array, u: Array, x: Array, y: Array) -> Array:
+    """x - T^-1 W^-2 y (nc, 3), with the T of `pulls`."""
+    out = np.empty(x.shape)
+    for c in range(len(x)):
+        out[c, 0], out[c, 1], out[c, 2] = _scaled(root, size, c, y, True)
+        n, t_1, t_2 = _scaled(root, size, c, out, True)
+        out[c, 0] = x[c, 0] - (n - (u[c, 1] * t_1 + u[c, 2] * t_2))
+        out[c, 1], out[c, 2] = x[c, 1] - t_1, x[c, 2] - t_2
+    return out
+
+
+@loop
+def centring(root: Array, size: Array, z: Array, ds: Array, dz: Array, target: float) -> Array:
+    """The w (nc, 3) with W z o w = target e - W^-1 ds o W dz."""
+    out = np.empty(z.shape)
+    for c in range(len(z)):
+        p, q = _scaled(root, size, c, ds, True), _scaled(root, size, c, dz, False)
+        n, t_1, t_2 = _jordan(p[0], p[1], p[2], q[0], q[1], q[2])
+        x = _scaled(root, size, c, z, False)
+        out[c, 0], out[c, 1], out[c, 2] = _jordan_divide(x[0], x[1], x[2], target - n, -t_1, -t_2)
+    return out
+
+
+@loop
+def towards_path(
+    root: Array, size: Array, z: Array, ds: Array, dz: Array, reach: float, low: float, high: float
+) -> Array:
+    """The w (nc, 3) with W z o w = d: the d that moves the spectral values of (W z + reach W^-1 ds) o (W z + reach W
+    dz) into [low, high], but none by more than ``high`` downwards."""
+    out = np.empty(z.shape)
+    for c in range(len(z)):
+        x, p, q = _scaled(root, size, c, z, False), _scaled(root, size, c, ds, True), _scaled(root, size, c, dz, False)
+        n, t_1, t_2 = _jordan(
+            x[0] + reach * p[0], x[1] + reach * p[1], x[2] + reach * p[2],
+            x[0] + reach * q[0], x[1] + reach * q[1], x[2] + reach * q[2],
+        )  # fmt: skip
+        length = np.sqrt(t_1 * t_1 + t_2 * t_2)
+        more, less = _into(n + length, low, high), _into(n - length, low, high)
+        turn = 0.5 * (more - less) / max(length, TINY)
+        n, t_1, t_2 = 0.5 * (more + less), turn * t_1, turn * t_2
+        out[c, 0], out[c, 1], out[c, 2] = _jordan_divide(x[0], x[1], x[2], n, t_1, t_2)
+    return out
+
+
+@inlined
+def _into(value, low, high):
+    move = min(max(value, low), high) - value
+    return -high if move < -high else move
+
+
+@loop
+def central_pair(x: Array, tau: Array, complementarity: float) -> tuple[Array, Array]:
+    """The pair (s, z) inside the cones with s - tau z = x and s o z = complementarity e; tau (nc,).
+
+    In the spectral values l of x: s = (l + root(l^2 + 4 complementarity tau)) / 2, and z likewise of -l."""
+    s, z = np.empty(x.shape), np.empty(x.shape)
+    for c in range(len(x)):
+        size = np.sqrt(x[c, 1] * x[c, 1] + x[c, 2] * x[c, 2])
+        high, of_high = _central(x[c, 0] + size, 4.0 * complementarity * tau[c])
+        low, of_low = _central(x[c, 0] - size, 4.0 * complementarity * tau[c])
+        turn, back = 0.5 * (high - low) / max(size, TINY), 0.5 * (of_high - of_low) / max(size, TINY) / tau[c]
+        s[c, 0], s[c, 1], s[c, 2] = 0.5 * (high + low), turn * x[c, 1], turn * x[c, 2]
+        z[c, 0], z[c, 1], z[c, 2] = 0.5 * (of_high + of_low) / tau[c], back * x[c, 1], back * x[c, 2]
+    return s, z
+
+
+@inlined
+def _central(value, room):
+    """Two positive numbers whose difference is the value and whose product is room / 4."""
+    larger = 0.5 * (abs(value) + np.sqrt(value * value + room))
+    smaller = 0.25 * room / larger  # their difference would cancel
+    return (larger, smaller) if value > 0 else (smaller, larger)
+
+
+@loop
+def step_inside(x: Array, dx: Array) -> float:
+    """`step_to_boundary` in the cones of friction 1, for an x that rounding may have put on the boundary: there it is
+    not zero. It is zero where dx is no number.
+
+    By the smallest spectral value of dx seen from x (Vandenberghe, "The CVXOPT linear and quadratic cone program
+    solvers", 2010)."""
+    fastest = 0.0
+    for c in range(len(x)):
+        x_0, x_1, x_2 = x[c, 0], x[c, 1], x[c, 2]
+        dx_0, dx_1, dx_2 = dx[c, 0], dx[c, 1], dx[c, 2]
+        size = np.sqrt(_determinant(x_0, x_1, x_2))
+        inner = (x_0 * dx_0 - x_1 * dx_1 - x_2 * dx_2) / size
+        along = (inner + dx_0) / (x_0 + size)
+        turned_1, turned_2 = dx_1 - along * x_1, dx_2 - along * x_2
+        speed = (np.sqrt(turned_1 * turned_1 + turned_2 * turned_2) - inner) / size
+        if not speed <= fastest:
+            fastest = speed
+            if speed != speed:
+                return 0.0
+    return 1.0 / fastest if fastest > 0 else np.inf
+
+
+@loop
+def determinant(x: Array) -> Array:
+    """x_0^2 - |x_1:|^2 (nc,) of points inside, kept positive in spite of rounding.
+
+    Near the boundary rounding is at most 1.5 eps x_0^2: the first difference is exact, and neither the product nor the
+    square is larger than x_0^2 / 2."""
+    out = np.empty(len(x))
+    for c in range(len(x)):
+        out[c] = _determinant(x[c, 0], x[c, 1], x[c, 2])
+    return out
+
+
+@inlined
+def _scaled(root, size, c, x, inverse):
+    """W x of a contact, or W^-1 x."""
+    first, u, v, eta = root[c, 0], root[c, 1], root[c, 2], size[c]
+    if inverse:
+        u, v, eta = -u, -v, 1.0 / eta
+    along = 2.0 * (first * x[c, 0] + u * x[c, 1] + v * x[c, 2])
+    return (along * first - x[c, 0]) * eta, (along * u + x[c, 1]) * eta, (along * v + x[c, 2]) * eta
+
+
+@inlined
+def _jordan(x_0, x_1, x_2, y_0, y_1, y_2):
+    """x o y."""
+    return x_0 * y_0 + x_1 * y_1 + x_2 * y_2, x_0 * y_1 + y_0 * x_1, x_0 * y_2 + y_0 * x_2
+
+
+@inlined
+def _jordan_divide(x_0, x_1, x_2, y_0, y_1, y_2):
+    """The w with x o w = y; x inside the cone."""
+    first = (x_0 * y_0 - x_1 * y_1 - x_2 * y_2) / _determinant(x_0, x_1, x_2)
+    return first, (y_1 - first * x_1) / x_0, (y_2 - first * x_2) / x_0
+
+
+@inlined
+def _determinant(x_0, x_1, x_2):
+    small, large = abs(x_1), abs(x_2)
+    if small > large:
+        small, large = large, small
+    found = (x_0 - large) * (x_0 + large) - small * small
+    least = max(LEAST * x_0 * x_0, TINY)
+    return least if found < least else found
