@@ -36,7 +36,7 @@ sim = pctt.Simulation(scene, dt=0.01, delta=0.01)
 sim.run(until=1.0)
 fan = sim.body("fan")
 print("spin", fan.velocity[5], "rad/s")  # torque times time over inertia
-fan.motion.torque = -2.0
+sim.change("body fan", torque=-2.0)
 sim.run(until=2.0)
 print("and back to", abs(round(fan.velocity[5], 9)))
 

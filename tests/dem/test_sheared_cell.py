@@ -124,7 +124,7 @@ def test_kept_lists_find_what_new_ones_find():
 def test_restart_goes_on_with_the_same_bits(tmp_path):
     sim = sheared(MPI.COMM_WORLD)
     sim.run(steps=6)
-    sim.set_shear_rate(-2.0)
+    sim.change("cell", shear_rate=-2.0)
     sim.run(steps=3)
     sim.save(tmp_path / "state.h5")
     more = {"dt": 0.002, "solver": "apgd", "tol": 1e-7}
@@ -150,4 +150,4 @@ def test_refused():
     scene = Scene(0.3, period=(0.5, 0.5, None))
     scene.add_spheres([[0.1, 0.1, 0.1]], radius=0.05, density=1000.0)
     with pytest.raises(ValueError, match="is not sheared"):
-        pctt.Simulation(scene, dt=0.01).set_shear_rate(1.0)
+        pctt.Simulation(scene, dt=0.01).change("cell", shear_rate=1.0)

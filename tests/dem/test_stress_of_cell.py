@@ -50,10 +50,10 @@ def test_isotropic_cell_reaches_its_stress_and_stays():
     assert max(late) < 0.02
     assert sim.period.prod() < 0.0404 * 0.0408 * 0.0402
     asked = np.array([1.0, 1.0, 1.2]) * PRESSURE
-    sim.set_stress(asked)
+    sim.change("cell", stress=asked)
     sim.run(steps=200, stop=lambda sim: error(sim, asked) < 0.01)
     assert error(sim, asked) < 0.01
-    sim.set_stress((None, None, 2.0 * PRESSURE))
+    sim.change("cell", stress=(None, None, 2.0 * PRESSURE))
     before = sim.period
     sim.run(steps=3)
     np.testing.assert_array_equal(sim.period[:2], before[:2])
@@ -99,7 +99,7 @@ def test_strain_rate_takes_the_place_of_the_stress():
     sim.run(steps=10)
     assert sim.period[2] == pytest.approx(before[2] * (1.0 - 0.001 * 0.5) ** 10, rel=1e-12)
     np.testing.assert_allclose(stress(sim)[:2], PRESSURE, rtol=2e-3)
-    sim.set_strain_rate((None, -0.5, 0.0))
+    sim.change("cell", strain_rate=(None, -0.5, 0.0))
     then = sim.period
     sim.run(steps=5)
     assert sim.period[1] == pytest.approx(then[1] * (1.0 + 0.001 * 0.5) ** 5, rel=1e-12)
@@ -229,7 +229,7 @@ def of_motion(sim):
 def test_restart_goes_on_with_the_same_bits(tmp_path):
     sim = packed(MPI.COMM_WORLD, (PRESSURE, None, PRESSURE), sheared=True)
     sim.run(steps=6)
-    sim.set_stress((PRESSURE, 2.0 * PRESSURE, PRESSURE))
+    sim.change("cell", stress=(PRESSURE, 2.0 * PRESSURE, PRESSURE))
     sim.run(steps=3)
     sim.save(tmp_path / "state.h5")
     other = pctt.Simulation.load(tmp_path / "state.h5", sim.experiment, comm=MPI.COMM_WORLD, **OF_RUNS)
@@ -274,8 +274,8 @@ def test_refused():
         walled.grains()
     with pytest.raises(ValueError, match="contacts that give way"):
         pctt.Simulation(scene(stiffness=np.inf), dt=0.01)
-    with pytest.raises(ValueError, match="periods of this scene are constant"):
-        pctt.Simulation(scene(stress=None), dt=0.01).set_stress((None, None, 1e3))
+    with pytest.raises(ValueError, match="periods of this cell are constant"):
+        pctt.Simulation(scene(stress=None), dt=0.01).change("cell", stress=(None, None, 1e3))
 
 
 @pytest.mark.slow
