@@ -13,10 +13,10 @@ from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.clumps import Form
+from dem.contact_law import ContactLaw
 from dem.joints import Joint
 from dem.loads import Load
 from dem.motion import Dynamic, Fixed, Pose, checked_pose, velocity_between
-from dem.pairs import Pairs
 from dem.polyhedra import Solid
 from dem.scene import LargeBody
 from dem.sources import Outlet, Source, Tally, as_array
@@ -71,7 +71,7 @@ class World:
     comm: MPI.Comm
     large_bodies: tuple[LargeBody, ...]
     gravity: Floats  #: (3,) [m/s^2]
-    pairs: Pairs  #: coefficients of contacts by pair of materials
+    pairs: ContactLaw  #: tables of the coefficients of contacts, by pair of materials
     materials: tuple[str, ...]  #: their names; the column `material` of a table of bodies is an index into them
     grains: Bodies  #: the slab of this rank; replace it by `set_grains` only
     large: Bodies  #: one row per large body

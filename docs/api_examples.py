@@ -301,7 +301,7 @@ sim = pctt.Simulation(scene, dt=0.005, solver="apgd", tol=1e-8)
 sim.run(until=1.0)
 print("rolls at", round(sim.body("wheel").velocity[0], 4), "m/s: 3 rad/s times 0.2 m")
 
-# %% dem.pairs.Pairs
+# %% dem.contact_law.ContactLaw
 import pctt
 from dem.scene import Scene
 

@@ -19,7 +19,9 @@ OF_RUNS = {"dt": 0.001, "solver": "apgd", "tol": 1e-6}
 def packed(comm=MPI.COMM_SELF, stress=(PRESSURE,) * 3, capsules=False, sheared=False, **more):
     """A dense cell of 64 grains, a little moved and turned from a lattice; contacts close to it."""
     shear = {"shear_rate": 2.0, "shear_gradient": "z"} if sheared else {}
-    scene = Scene(0.4, (0.0, 0.0, 0.0), 27000.0, period=(0.0404, 0.0408, 0.0402), stress=stress, **shear, **more)
+    scene = Scene(
+        0.4, (0.0, 0.0, 0.0), stiffness=27000.0, period=(0.0404, 0.0408, 0.0402), stress=stress, **shear, **more
+    )
     random = np.random.default_rng(3)
     grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
     place = grid * [0.0101, 0.0102, 0.01005] + random.uniform(-4e-5, 4e-5, grid.shape)
@@ -61,7 +63,7 @@ def test_isotropic_cell_reaches_its_stress_and_stays():
 
 def test_loose_cell_closes_affinely():
     """Grains that touch nothing keep their places relative to the cell, and their velocities beside it."""
-    scene = Scene(0.4, (0.0, 0.0, 0.0), 1e4, period=(0.1, 0.1, 0.1), stress=(None, None, PRESSURE))
+    scene = Scene(0.4, (0.0, 0.0, 0.0), stiffness=1e4, period=(0.1, 0.1, 0.1), stress=(None, None, PRESSURE))
     place = np.array([[0.02, 0.03, 0.01], [0.05, 0.06, 0.05], [0.07, 0.05, 0.09]])
     scene.add_spheres(place, 0.005, 2500.0)
     sim = pctt.Simulation(scene, **OF_RUNS)
@@ -74,7 +76,7 @@ def test_loose_cell_closes_affinely():
 
 def lattice(start=0.0, strain_rate=None):
     """A simple cubic lattice of spheres that just touch."""
-    scene = Scene(0.3, (0.0, 0.0, 0.0), 1e4, period=(0.04, 0.04, 0.05), stress=(PRESSURE,) * 3,
+    scene = Scene(0.3, (0.0, 0.0, 0.0), stiffness=1e4, period=(0.04, 0.04, 0.05), stress=(PRESSURE,) * 3,
                   strain_rate=strain_rate, strain_start=start)  # fmt: skip
     grid = np.stack(np.meshgrid(range(4), range(4), range(5), indexing="ij"), axis=-1).reshape(-1, 3)
     scene.add_spheres(0.01 * grid, 0.005, 2500.0)
