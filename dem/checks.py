@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import difflib
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 
 from dem.arrays import ArrayLike, Floats
+
+
+def nearest(name: str, known: Iterable[str], dash: str = "", alike: float = 0.6) -> str:
+    """The end of a message: the known name that the user may have meant, if the two are ``alike`` (of `difflib`)."""
+    close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=alike)
+    return f"; did you mean {dash}{close[0]}?" if close else ""
 
 
 def finite(name: str, values: ArrayLike) -> Floats:

@@ -20,7 +20,7 @@ class ImpulseMemory:
     """
 
     def __init__(self, comm: MPI.Comm, parts: int = 1) -> None:
-        """`parts`: how often a contact has three numbers, see `dem.pairs.Pairs.parts`."""
+        """`parts`: how often a contact has three numbers, see `ContactLaw.parts`."""
         self._comm, self._parts = comm, parts
         self.restore(np.zeros(0, np.complex128), np.zeros((0, 4 * parts)))
 

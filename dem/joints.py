@@ -15,10 +15,9 @@ they are solved once more with it (`refound`).
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from dem import checks, quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.free_motion import free_spin, unequal
 from dem.motion import DROOP
+from dem.named import Named
 from dem.springs import End, Ends
 
 KINDS = ("hinge", "slider", "ball", "fixed")
@@ -44,7 +44,7 @@ HELD, MOTOR, LOWER, UPPER = range(4)  #: kinds of rows: what a joint holds, its 
 
 
 @dataclass(frozen=True)
-class Joint:
+class Joint(Named):
     """A joint. The anchors and frames are in the frames of its bodies; of the world they are places."""
 
     kind: str
@@ -56,6 +56,8 @@ class Joint:
     strength: float = np.inf  #: the greatest torque [N m] or force [N] of the motor
     low: float = -np.inf  #: least angle [rad] or position [m]
     high: float = np.inf  #: greatest one
+    CHANGED: ClassVar = ("speed", "target", "strength", "low", "high")
+    KEPT: ClassVar = CHANGED
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -85,10 +87,8 @@ class Joint:
         """The number of its free coordinate among three translations and three turns: that of motors and limits."""
         return 2 if self.kind == "slider" else 5
 
-    def changed(self, **values: Any) -> Joint:
-        """The joint with another `speed`, `target` (the other of both is then None), `strength`, `low` or `high`."""
-        if other := sorted(set(values) - {"speed", "target", "strength", "low", "high"}):
-            raise ValueError(f"{other[0]} of a joint cannot be set; allowed are speed, target, strength, low and high")
+    def changed(self, time: float, tally: Any, **values: Any) -> Joint:
+        """As of `Named`; with a `speed` there is no `target`, and the other way round."""
         if values.get("speed") is not None:
             values.setdefault("target", None)
         if values.get("target") is not None:
@@ -323,14 +323,3 @@ def _roots(matrix: Floats) -> Floats:
     """Symmetric roots of symmetric matrices (n, 6, 6)."""
     value, vector = np.linalg.eigh(matrix)
     return (vector * np.sqrt(np.maximum(value, 0.0))[:, None]) @ vector.transpose(0, 2, 1)
-
-
-def as_text(joints: dict[str, Joint]) -> str:
-    """Joints as text, for `from_text`."""
-    return json.dumps({name: dataclasses.asdict(joint) for name, joint in joints.items()})
-
-
-def from_text(text: str) -> dict[str, Joint]:
-    """The joints of a text."""
-    values: dict[str, Any] = json.loads(text)
-    return {name: Joint(**{**given, "ends": tuple(given["ends"])}) for name, given in values.items()}

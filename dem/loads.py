@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Union
+from typing import ClassVar, Union
 
 import numpy as np
 
@@ -14,6 +12,7 @@ from dem import checks
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.bodies import Bodies
 from dem.motion import Timed
+from dem.named import Named
 
 #: The time [s] and the table of n bodies at the start of a step; returns forces [N] or torques [N m], (3,) or (n, 3).
 Law = Callable[[float, Bodies], ArrayLike]
@@ -23,7 +22,7 @@ On = Union[str, Sequence[int], None]
 
 
 @dataclass(frozen=True)
-class Load(Timed):
+class Load(Named, Timed):
     """A force at the centre of mass, and a torque, on each of some bodies from one time to another, in the world frame.
 
     Both are numbers (3,) for each body or, of ids, rows (ids, 3) in their order; or a `Law` of the time and the state
@@ -35,6 +34,8 @@ class Load(Timed):
     torque: ArrayLike | Law = (0.0, 0.0, 0.0)  #: [N m]
     start: float = 0.0  #: [s]
     end: float = np.inf  #: [s]
+    CHANGED: ClassVar = ("on", "force", "torque", "start", "end")
+    KEPT: ClassVar = CHANGED
 
     def __post_init__(self) -> None:
         self._check_times()
@@ -73,26 +74,3 @@ class Load(Timed):
             else:
                 out[:, part] = value if value.ndim == 1 else value[place]
         return (self.gone(time + dt) - self.gone(time)) * out
-
-    def changed(self, **values: Any) -> Load:
-        """The load with other numbers. ValueError for a law, which a checkpoint could not keep."""
-        for name, value in values.items():
-            if callable(value):
-                raise ValueError(f"{name} of a load can be set to numbers within a run; a law comes from the scene")
-        return dataclasses.replace(self, **values)
-
-
-def as_text(loads: dict[str, Load]) -> str:
-    """The numbers of loads as text, for `from_text`."""
-    found = {
-        name: {key: value for key, value in vars(load).items() if not callable(value)} for name, load in loads.items()
-    }
-    return json.dumps(found, default=lambda array: array.tolist())
-
-
-def from_text(text: str, known: dict[str, Load]) -> dict[str, Load]:
-    """The loads of a text; the laws are those of the `known` ones of their names."""
-    return {
-        name: dataclasses.replace(known[name], **values) if name in known else Load(**values)
-        for name, values in json.loads(text).items()
-    }

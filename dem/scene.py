@@ -20,16 +20,16 @@ from typing import Any, Union
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, checks, clumps, polyhedra, quaternion, shapes
+from dem import bodies, checks, clumps, contact_law, polyhedra, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints, Rule
 from dem.bodies import BOX, CAPSULE, CLUMP, COMPOUND, MESH, PLANE, POLYHEDRON, SPHERE, Bodies
 from dem.clumps import Form
+from dem.contact_law import ContactLaw
 from dem.joints import Joint, whole_periods
 from dem.loads import Law, Load, On
 from dem.measures import Block, Cylinder
 from dem.mesh import Mesh
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
-from dem.pairs import Pairs, checked, tables
 from dem.polyhedra import Solid
 from dem.quaternion import across, length
 from dem.shapes import Box, Capsule, Clump, Shape
@@ -135,24 +135,18 @@ class Scene:
         self,
         friction: float,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
-        stiffness: float | None = None,
-        restitution: float = 0.0,
         *,
-        cohesion: float = 0.0,
-        cohesion_range: float = 0.0,
-        rolling: float = 0.0,
-        spinning: float = 0.0,
         period: Sequence[float | None] | None = None,
         shear_rate: float | None = None,
         shear_gradient: str = "y",
         stress: Sequence[float | None] | None = None,
         strain_rate: Sequence[float | None] | None = None,
         strain_start: float = 0.0,
+        **law: float | None,
     ) -> None:
-        """`gravity`: (3,) [m/s^2]. The others are coefficients of the contacts of all pairs of materials, but of those
-        of `set_pair`: `friction`, `stiffness` [N/m] (inf: rigid; None: `dem.stiffness.recommended`), `restitution`, the
-        attractive force `cohesion` [N] up to a gap of `cohesion_range` [m], and the greatest moments against `rolling`
-        and `spinning`, over the normal force [m]. See `dem.pairs` and docs/contact_laws.md.
+        """`gravity`: (3,) [m/s^2]. `friction` and the `law`, such as `stiffness`, `restitution` or `cohesion`, are the
+        coefficients of the contacts of all pairs of materials, but of those of `set_pair`: the fields of
+        `dem.contact_law.ContactLaw`, see docs/contact_laws.md.
         `period`: (3,) lengths of the cell, from zero on, that repeats itself along x, y, z [m], None: not along that
         axis. `shear_rate`: d v_x / dy of the cell, or d v_x / dz for the `shear_gradient` "z" [1/s]; None: it is at
         rest. `stress`: (3,) that the cell is to have along x, y, z, positive in compression [Pa]: its periods then
@@ -178,13 +172,8 @@ class Scene:
         self.large_bodies: list[LargeBody] = []
         #: Names of large bodies that go away from the grains: their speed asks for no stiffness.
         self.leaving: set[str] = set()
-        self._usual = checked(
-            {
-                "friction": friction, "stiffness": stiffness, "restitution": restitution, "cohesion": cohesion,
-                "cohesion_range": cohesion_range, "rolling": rolling, "spinning": spinning,
-            }
-        )  # fmt: skip
-        self._pairs: dict[tuple[int, int], dict[str, float]] = {}
+        self._law = contact_law.law({"friction": friction, **law})
+        self._pairs: dict[tuple[int, int], ContactLaw] = {}
         self._materials: dict[str, int] = {}
         self.parts: list[Part] = []  #: the grains, as they were added
         self._survey: Survey | None = None
@@ -535,37 +524,20 @@ class Scene:
         size = np.outer(radius[rows], [1.0, 0.0, 0.0])
         return replace(self.large().take(rows), shape=np.full(len(rows), SPHERE), size=size)
 
-    def set_pair(
-        self,
-        material: str,
-        other: str,
-        *,
-        friction: float | None = None,
-        stiffness: float | None = None,
-        restitution: float | None = None,
-        cohesion: float | None = None,
-        cohesion_range: float | None = None,
-        rolling: float | None = None,
-        spinning: float | None = None,
-    ) -> None:
-        """Coefficients of the contacts of two materials (which may be the same one), with the units of `Scene`; those
-        not given stay as they are. ValueError for a bad one."""
-        given = {
-            "friction": friction, "stiffness": stiffness, "restitution": restitution, "cohesion": cohesion,
-            "cohesion_range": cohesion_range, "rolling": rolling, "spinning": spinning,
-        }  # fmt: skip
+    def set_pair(self, material: str, other: str, **law: float | None) -> None:
+        """Coefficients of the contacts of two materials (which may be the same one), the fields of
+        `dem.contact_law.ContactLaw`; those not given stay as they are. ValueError for a bad one."""
         one, two = sorted((self._material(material), self._material(other)))
-        self._pairs.setdefault((one, two), {}).update(checked(given))
+        self._pairs[one, two] = contact_law.law(law, self._pairs.get((one, two), self._law))
 
     @property
     def materials(self) -> tuple[str, ...]:
         """The names of the materials, in the order of their numbers."""
         return tuple(self._materials)
 
-    def pairs(self, stiffness: float) -> Pairs:
-        """The coefficients of all pairs of materials, with this `stiffness` [N/m] where none is stated. ValueError for
-        those that contradict each other."""
-        return tables(len(self._materials), {"stiffness": stiffness, **self._usual}, self._pairs)
+    def pairs(self, stiffness: float) -> ContactLaw:
+        """The tables of all pairs of materials, with this `stiffness` [N/m] where none is stated."""
+        return contact_law.tables(len(self._materials), self._law, self._pairs, stiffness)
 
     @property
     def reach(self) -> float:
@@ -576,7 +548,7 @@ class Scene:
     @property
     def states_stiffness(self) -> bool:
         """Whether the stiffness of all or some contacts was stated."""
-        return any("stiffness" in given for given in (self._usual, *self._pairs.values()))
+        return any(law.stiffness is not None for law in (self._law, *self._pairs.values()))
 
     def grains(self, first: int = 0, end: int | None = None) -> Bodies:
         """The grains from the id `first` on and before `end`, all by default. ValueError if there is nothing that

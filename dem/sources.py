@@ -6,10 +6,9 @@ these. So no generator has a state, and a run that goes on from a checkpoint has
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from dem.arrays import Bools, Floats, Ints
 from dem.bodies import SPHERE, Bodies, enclosing_radius
 from dem.measures import Block, Cylinder
 from dem.motion import Timed
+from dem.named import Named
 from dem.shapes import Box, Capsule
 from dem.together import digest
 
@@ -25,7 +25,6 @@ from dem.together import digest
 MOST_IDS = 10**12
 
 TRIES = 64  #: places that are tried for a grain in a step
-CHANGES = ("mass_rate", "number_rate", "velocity", "start", "before")  #: fields of a source that change within a run
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ class Listed:
 
 
 @dataclass(frozen=True)
-class Source(Timed):
+class Source(Named, Timed):
     """Grains come in a region, at a mass rate or a number rate, where there is room for them.
 
     They are spheres of the sizes `radius`, or boxes or capsules whose lengths are those of `shape` times a size, turned
@@ -95,6 +94,8 @@ class Source(Timed):
     end: float = np.inf  #: [s]
     seed: int = 0
     before: float = 0.0  #: what was due before `start`, with other rates [kg] or grains
+    CHANGED: ClassVar = ("mass_rate", "number_rate", "velocity")
+    KEPT: ClassVar = (*CHANGED, "start", "before")
 
     def __post_init__(self) -> None:
         self._check_times()
@@ -169,8 +170,6 @@ class Source(Timed):
     def changed(self, time: float, tally: Tally, **values: Any) -> Source:
         """The same with another `mass_rate`, `number_rate` or `velocity` from the time [s] on. What was due before and
         found no place stays due, but where masses take the place of numbers or the other way round."""
-        if other := sorted(set(values) - {"mass_rate", "number_rate", "velocity"}):
-            raise ValueError(f"{other[0]} of a source cannot be set; allowed are mass_rate, number_rate and velocity")
         rates = {name: values[name] for name in ("mass_rate", "number_rate") if values.get(name) is not None}
         out: dict[str, Any] = {"velocity": values["velocity"]} if "velocity" in values else {}
         if rates:
@@ -211,20 +210,6 @@ class Tally:
     mass: float = 0.0  #: [kg]
     energy: float = 0.0  #: kinetic and potential, of the last step alone [J]
     refused: int = 0  #: steps in which the next grain of a source was due, but found no place
-
-
-def as_text(sources: dict[str, Source]) -> str:
-    """What `Source.changed` may change of sources as text, for `from_text`."""
-    numbers = {name: {key: getattr(source, key) for key in CHANGES} for name, source in sources.items()}
-    return json.dumps(numbers, default=lambda array: array.tolist())
-
-
-def from_text(text: str, sources: dict[str, Source]) -> dict[str, Source]:
-    """These sources of a scene as a text says. ValueError for a source that the scene does not have."""
-    found = json.loads(text)
-    if other := sorted(set(found) - set(sources)):
-        raise ValueError(f"the scene has no source {other[0]!r}")
-    return {name: replace(sources[name], **values) for name, values in found.items()}
 
 
 def as_array(tallies: dict[str, Tally]) -> Floats:

@@ -18,23 +18,22 @@ bears does not see it fall, and what a damper misses in the step of an impact it
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Union
+from typing import ClassVar, Union
 
 import numpy as np
 
 from dem import checks, quaternion
 from dem.arrays import Floats
+from dem.named import Named
 
 #: A large body by its name, a grain by its id, or the world.
 End = Union[str, int, None]
 
 
 @dataclass(frozen=True)
-class Spring:
+class Spring(Named):
     """A spring with a damper. Anchors are in the frames of their bodies, or places in the world."""
 
     ends: tuple[End, End]
@@ -42,6 +41,8 @@ class Spring:
     stiffness: float = 0.0  #: [N/m]
     damping: float = 0.0  #: [N s/m]
     length: float = 0.0  #: at rest [m]
+    CHANGED: ClassVar = ("stiffness", "damping", "length")
+    KEPT: ClassVar = CHANGED
 
     def __post_init__(self) -> None:
         ends = tuple(end if end is None or isinstance(end, str) else int(end) for end in self.ends)
@@ -112,14 +113,3 @@ def impulses(
     np.add.at(change, row, np.einsum("skix,si->skx", A, g))
     velocity = ends.free + np.einsum("nxy,ny->nx", ends.inverse_mass, change)
     return g, change, velocity[row], float(np.sqrt(highest))
-
-
-def as_text(springs: dict[str, Spring]) -> str:
-    """Springs as text, for `from_text`."""
-    return json.dumps({name: dataclasses.asdict(spring) for name, spring in springs.items()})
-
-
-def from_text(text: str) -> dict[str, Spring]:
-    """The springs of a text."""
-    values: dict[str, Any] = json.loads(text)
-    return {name: Spring(**{**given, "ends": tuple(given["ends"])}) for name, given in values.items()}

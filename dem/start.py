@@ -12,6 +12,7 @@ from mpi4py import MPI
 from dem import bodies, stiffness
 from dem.arrays import Ints
 from dem.bodies import Bodies
+from dem.changes import refuse_load
 from dem.clumps import Form
 from dem.contact import find_contacts
 from dem.exchange import exchange, refuse
@@ -21,7 +22,7 @@ from dem.polyhedra import Solid
 from dem.scene import Scene, least_half
 from dem.sources import Tally, from_array
 from dem.step import follow_motions
-from dem.world import Servo, Shear, World, refuse_load
+from dem.world import Servo, Shear, World
 
 
 def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
@@ -69,11 +70,11 @@ def restored_world(
             f"the state has {world.slabs[-1]} grains and {len(large['id'])} large bodies, "
             f"the scene {count} and {len(world.large)}"
         )
-    world.large = Bodies(**{**large, "id": world.large.id})  # versions before had others beside sources
+    world.large = Bodies(**large)
     world.time, world.step = float(replicated["time"]), int(replicated["step"])
     expected = np.array(replicated["expected"]) if "expected" in replicated else None
     world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
-    world.spare = float(replicated.get("spare", World.spare))
+    world.spare = float(replicated["spare"])
     _restore_cell(world, replicated)
     _refuse_impossible(world)
     if len(replicated["slabs"]) != comm.size + 1:

@@ -33,9 +33,9 @@ import numpy as np
 from dem import bodies, checks, quaternion
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.compiled import inlined, loop
+from dem.contact_law import ContactLaw
 from dem.falls import DENSE, area, fall
 from dem.motion import Dynamic
-from dem.pairs import Pairs
 from dem.pressing import CHAINS, Pressing, pressing
 from dem.scene import Scene
 from dem.shapes import Plane, placed
@@ -51,7 +51,7 @@ TANGENTIAL = 2.0 / 7.0  #: k_t / k: both directions of an impact of spheres take
 DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed (Schwager, Poeschel); 1: 14 %
 
 
-def pairs(scene: Scene) -> Pairs:
+def pairs(scene: Scene) -> ContactLaw:
     """The coefficients of contacts by pair of materials, with the recommended stiffness where none is stated."""
     return scene.pairs(recommended(scene))
 

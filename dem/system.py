@@ -241,7 +241,7 @@ class ContactSystem:
         stiffness.pull_back(self.r, self.compliance, self.held)
 
     def held_after(self, impulse: Floats) -> Floats:
-        """Impulses of the step (parts nc, 3), see `dem.pairs.Pairs.parts`, with what tangential springs hold at its end
+        """Impulses of the step (parts nc, 3), see `ContactLaw.parts`, with what tangential springs hold at its end
         in the place of the tangential ones [N s]."""
         return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
 

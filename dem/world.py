@@ -1,29 +1,24 @@
-"""The state of a simulation on one rank, and changes of the motion of large bodies within a run.
-
-The functions of a change are called on all ranks alike, with the same arguments.
-"""
+"""The state of a simulation on one rank."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, checks, joints, loads, quaternion, sources, springs
-from dem import motion as motions
+from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.clumps import Form
+from dem.contact_law import ContactLaw
 from dem.joints import Joint
-from dem.loads import Load, On
-from dem.motion import Dynamic, Fixed, Motion, Pose, Prescribed, changed, checked_pose, velocity_between
-from dem.pairs import Pairs
+from dem.loads import Load
+from dem.motion import Dynamic, Fixed, Pose, checked_pose, velocity_between
 from dem.polyhedra import Solid
-from dem.scene import LargeBody, SurfaceVelocity, checked_surface
+from dem.scene import LargeBody
 from dem.sources import Outlet, Source, Tally, as_array
 from dem.springs import Spring
 from dem.together import together
@@ -76,13 +71,13 @@ class World:
     comm: MPI.Comm
     large_bodies: tuple[LargeBody, ...]
     gravity: Floats  #: (3,) [m/s^2]
-    pairs: Pairs  #: coefficients of contacts by pair of materials
+    pairs: ContactLaw  #: tables of the coefficients of contacts, by pair of materials
     materials: tuple[str, ...]  #: their names; the column `material` of a table of bodies is an index into them
     grains: Bodies  #: the slab of this rank; replace it by `set_grains` only
     large: Bodies  #: one row per large body
-    loads: dict[str, Load] = field(default_factory=dict)  #: by name; change them by `set_load` only
-    springs: dict[str, Spring] = field(default_factory=dict)  #: by name; change them by `set_spring` only
-    joints: dict[str, Joint] = field(default_factory=dict)  #: by name; change them by `set_joint` only
+    loads: dict[str, Load] = field(default_factory=dict)  #: by name; `dem.changes.change` alone changes parts
+    springs: dict[str, Spring] = field(default_factory=dict)  #: by name
+    joints: dict[str, Joint] = field(default_factory=dict)  #: by name
     period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
     sources: dict[str, Source] = field(default_factory=dict)  #: by name
     outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
@@ -99,15 +94,8 @@ class World:
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
 
-    changed: set[str] = field(init=False, default_factory=set)  #: large bodies with another motion than the scene gave
-
-    loads_set: set[str] = field(init=False, default_factory=set)  #: loads with other numbers than the scene gave
-
-    springs_set: set[str] = field(init=False, default_factory=set)  #: springs with other numbers than the scene gave
-
-    joints_set: set[str] = field(init=False, default_factory=set)  #: joints with other numbers than the scene gave
-
-    sources_set: set[str] = field(init=False, default_factory=set)  #: sources that the scene gave otherwise
+    #: Kinds and names of what a run has changed by `dem.changes.change`: large bodies, loads, springs and others.
+    changed: set[tuple[str, str]] = field(init=False, default_factory=set)
 
     lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
 
@@ -189,7 +177,7 @@ class World:
         """Put this large body in the place of that of its name; the same on all ranks."""
         row = self.large_row(body.name)
         self.large_bodies = (*self.large_bodies[:row], body, *self.large_bodies[row + 1 :])
-        self.changed.add(body.name)
+        self.changed.add(("body", body.name))
         self._poses, self._followed = {}, {}
         self.act_anew()
 
@@ -251,197 +239,3 @@ class World:
 def turns_unlike_spheres(world: World) -> bool:
     """Whether a body that turns freely may do so in another way than a sphere; the same on all ranks."""
     return not world.only_spheres or bool(np.isfinite(world.large.inertia).all(axis=1).any())
-
-
-def set_motion(world: World, name: str, motion: Motion | None = None, **values: Any) -> None:
-    """Give a large body another motion, or its own one with other `values` as of `changed`; it begins where it is now.
-    ValueError for one that it cannot have: if forces move the body, they go on doing so along the same line or about
-    the same axis; else they cannot begin to."""
-    row = world.large_row(name)
-    body = world.large_bodies[row]
-    motion = changed(body.motion, world.time, **values) if motion is None else motion
-    pose = body.position, body.quaternion
-    motions.refuse_ignored(motion)
-    _refuse_other_ways(body, motion)
-    if not isinstance(motion, Dynamic):
-        pose = _leading_to(motion, world.time, world.large.position[row], world.large.quaternion[row])
-    world.replace_large(dataclasses.replace(body, motion=motion, position=pose[0], quaternion=pose[1]))
-
-
-def set_surface(world: World, name: str, velocity: SurfaceVelocity | None) -> None:
-    """Let the surface of a large body move along itself at another velocity (3,) in the body frame [m/s]. ValueError
-    for a function, which a checkpoint could not keep."""
-    if callable(velocity):
-        raise ValueError(f"surface velocity of {name!r} can be set to a vector within a run; a function is the scene's")
-    body = world.large_bodies[world.large_row(name)]
-    world.replace_large(dataclasses.replace(body, surface=checked_surface(name, velocity)))
-
-
-def _refuse_other_ways(body: LargeBody, motion: Motion) -> None:
-    """ValueError for a motion by which forces would move a body in other ways than by its own, or would begin to."""
-    if not (isinstance(body.motion, Dynamic) or isinstance(motion, Dynamic)):
-        return
-    if type(motion) is not type(body.motion) or not np.allclose(_ways(motion), _ways(body.motion), atol=1e-12):
-        kind = f"{type(body.motion).__name__} with another drive" if isinstance(body.motion, Dynamic) else "a path"
-        raise ValueError(f"body {body.name!r} cannot change its motion to {motion!r}: allowed is {kind}")
-
-
-def _ways(motion: Any) -> Floats:
-    """Projectors (2, 3, 3) on what forces and torques can move."""
-    return np.array([motion.free_directions(), motion.free_turns()])
-
-
-def set_shear_rate(world: World, rate: float) -> None:
-    """Shear the cell at another rate [1/s] from now on. ValueError if the scene has no `shear_rate`."""
-    if world.shear is None:
-        raise ValueError("shear rate: the cell of this scene is not sheared; give the Scene a shear_rate, or 0")
-    world.shear = dataclasses.replace(world.shear, rate=float(checks.finite("shear rate", rate)))
-
-
-def set_stress(world: World, stress: Any) -> None:
-    """Ask for other stresses (3,) of the cell along x, y, z [Pa] from now on; None: none. ValueError if the scene has
-    neither `stress` nor `strain_rate`."""
-    world.servo = dataclasses.replace(_servo(world, "stress"), asked=checks.stress(stress))
-
-
-def set_strain_rate(world: World, strain_rate: Any) -> None:
-    """Compress the cell at other rates (3,) along x, y, z [1/s] from now on; None: the stress that is asked for, or
-    none. ValueError as of `set_stress`."""
-    servo = _servo(world, "strain_rate")
-    world.servo = dataclasses.replace(servo, strain=checks.strain_rate(strain_rate), start=world.time)
-
-
-def _servo(world: World, what: str) -> Servo:
-    if world.servo is None:
-        raise ValueError(f"{what}: the periods of this scene are constant; give the Scene a stress or a strain_rate")
-    return world.servo
-
-
-def set_load(world: World, name: str, on: On = None, **values: Any) -> None:
-    """Give a load other numbers: `force`, `torque`, `start` or `end`; a name that no load has begins one `on` some
-    bodies, all grains if nothing is given. ValueError for what it cannot be."""
-    load = world.loads[name].changed(**values) if name in world.loads else Load(on).changed(**values)
-    refuse_load(world, name, load)
-    world.loads[name] = load
-    world.loads_set.add(name)
-    world.act_anew()
-
-
-def refuse_load(world: World, name: str, load: Load) -> None:
-    """ValueError for a load on bodies that are not there, or that no force moves; not collective."""
-    if isinstance(load.on, str):
-        bodies_of_name = [body for body in world.large_bodies if body.name == load.on]
-        if bodies_of_name and not isinstance(bodies_of_name[0].motion, Dynamic):
-            raise ValueError(f"load {name!r}: the motion of the body {load.on!r} is prescribed, so no force moves it")
-        if bool(bodies_of_name) == (load.on in world.materials):
-            kind = "both a body and a material" if bodies_of_name else "neither a body nor a material"
-            raise ValueError(f"load {name!r}: {load.on!r} is {kind}")
-    elif load.ids is not None and len(wrong := load.ids[(load.ids < 0) | (load.ids >= world.ids)]):
-        raise ValueError(f"load {name!r}: there is no grain {wrong[0]}")
-
-
-def set_spring(world: World, name: str, **values: Any) -> None:
-    """Give a spring another `stiffness`, `damping` or rest `length`. ValueError for what it cannot have."""
-    if name not in world.springs:
-        raise ValueError(f"no spring {name!r}; there are: {', '.join(world.springs) or 'none'}")
-    if other := sorted(set(values) - {"stiffness", "damping", "length"}):
-        raise ValueError(f"spring {name!r}: {other[0]} cannot be set; allowed are stiffness, damping and length")
-    world.springs[name] = dataclasses.replace(world.springs[name], **values)
-    world.springs_set.add(name)
-    world.act_anew()
-
-
-def set_source(world: World, name: str, **values: Any) -> None:
-    """Give a source another `mass_rate` [kg/s] or `number_rate` [1/s], and `velocity` [m/s], from now on. ValueError
-    for what it cannot have."""
-    if name not in world.sources:
-        raise ValueError(f"no source {name!r}; there are: {', '.join(world.sources) or 'none'}")
-    world.sources[name] = world.sources[name].changed(world.time, world.tallies[name], **values)
-    world.sources_set.add(name)
-
-
-def restore_sources(world: World, text: str) -> None:
-    """Give a world, made from its scene, the sources of `dem.sources.as_text`. ValueError if that fails."""
-    for name, source in sources.from_text(text, world.sources).items():
-        world.sources[name] = source
-        world.sources_set.add(name)
-
-
-def set_joint(world: World, name: str, **values: Any) -> None:
-    """Give a joint another `speed`, `target`, `strength`, `low` or `high`. ValueError for what it cannot have."""
-    if name not in world.joints:
-        raise ValueError(f"no joint {name!r}; there are: {', '.join(world.joints) or 'none'}")
-    world.joints[name] = world.joints[name].changed(**values)
-    world.joints_set.add(name)
-
-
-def restore_joints(world: World, text: str) -> None:
-    """Give a world, made from its scene, the joints of `dem.joints.as_text`."""
-    for name, joint in joints.from_text(text).items():
-        world.joints[name] = joint
-        world.joints_set.add(name)
-
-
-def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> Pose:
-    """The pose at time zero of a body that the motion brings to this pose at `time`. ValueError if there is none."""
-    shift, turn = checked_pose(motion, time, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-    back = quaternion.conjugate(turn)
-    start = quaternion.rotate(back, position - shift), quaternion.multiply(back, orientation)
-    place, turned = checked_pose(motion, time, *start)
-    size = np.abs([place, position]).max() + np.abs(shift).max()
-    if np.abs(place - position).max() > 1e-9 * size or abs(turned @ orientation) < 1.0 - 1e-9:
-        raise ValueError(f"{type(motion).__name__} does not displace the pose at time zero: the body would jump")
-    return start
-
-
-def changed_motions(world: World) -> str:
-    """The motions that were changed as text, for `restore_motions`; empty if there are none."""
-    found = {
-        body.name: {
-            "motion": type(body.motion).__name__,
-            "values": {field.name: getattr(body.motion, field.name) for field in dataclasses.fields(body.motion)},
-            "position": body.position,
-            "quaternion": body.quaternion,
-            **({} if callable(body.surface) else {"surface": body.surface}),
-        }
-        for body in world.large_bodies
-        if body.name in world.changed
-    }
-    return json.dumps(found, default=lambda array: array.tolist()) if found else ""
-
-
-def restore_motions(world: World, text: str) -> None:
-    """Give the bodies of a world, made from its scene, the motions of `changed_motions`. ValueError for what is none: a
-    motion is one of `dem.motion` or that of the scene, with parameters that it has, by which the body can move, and the
-    pose is one."""
-    for name, entry in json.loads(text).items():
-        body = world.large_bodies[world.large_row(name)]
-        own = type(body.motion)
-        kind = own if own.__name__ == entry["motion"] else motions.KINDS.get(entry["motion"])
-        if kind is None:
-            raise ValueError(f"body {name!r}: neither the scene nor dem.motion has the motion {entry['motion']}")
-        if strange := sorted({*entry["values"]} - {field.name for field in dataclasses.fields(kind)}):
-            raise ValueError(f"body {name!r}: its motion {kind.__name__} has no {strange[0]}")
-        motion = kind(**entry["values"])
-        _refuse_other_ways(body, motion)
-        place = checks.vector(f"position of {name!r}", entry["position"])
-        turn = checks.rows(f"quaternion of {name!r}", entry["quaternion"], 1, 4)[0]
-        if abs(np.linalg.norm(turn) - 1.0) > 1e-6:
-            raise ValueError(f"quaternion of {name!r} is {turn.tolist()}; allowed is one of unit norm")
-        surface = checked_surface(name, entry["surface"]) if "surface" in entry else body.surface
-        world.replace_large(dataclasses.replace(body, motion=motion, position=place, quaternion=turn, surface=surface))
-
-
-def restore_loads(world: World, text: str) -> None:
-    """Give a world, made from its scene, the loads of `dem.loads.as_text`. ValueError if that fails."""
-    for name, load in loads.from_text(text, world.loads).items():
-        refuse_load(world, name, load)
-        world.loads[name] = load
-        world.loads_set.add(name)
-
-
-def restore_springs(world: World, text: str) -> None:
-    """Give a world, made from its scene, the springs of `dem.springs.as_text`."""
-    for name, spring in springs.from_text(text).items():
-        world.springs[name] = spring
-        world.springs_set.add(name)

@@ -36,7 +36,7 @@ sim = pctt.Simulation(scene, dt=0.01, delta=0.01)
 sim.run(until=1.0)
 fan = sim.body("fan")
 print("spin", fan.velocity[5], "rad/s")  # torque times time over inertia
-fan.motion.torque = -2.0
+sim.change("body fan", torque=-2.0)
 sim.run(until=2.0)
 print("and back to", abs(round(fan.velocity[5], 9)))
 
@@ -301,7 +301,7 @@ sim = pctt.Simulation(scene, dt=0.005, solver="apgd", tol=1e-8)
 sim.run(until=1.0)
 print("rolls at", round(sim.body("wheel").velocity[0], 4), "m/s: 3 rad/s times 0.2 m")
 
-# %% dem.pairs.Pairs
+# %% dem.contact_law.ContactLaw
 import pctt
 from dem.scene import Scene
 

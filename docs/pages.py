@@ -32,9 +32,9 @@ HELPERS = {"integral_problems", "comparison"}  # files that examples import
 PARTS = {
     "Simulations and their results": ["pctt", "pctt.simulation", "pctt.folder", "pctt.analysis", "dem.measures"],
     "What a scene is made of": [
-        "dem.scene", "dem.shapes", "dem.mesh", "dem.motion", "dem.pairs", "dem.loads", "dem.springs", "dem.joints",
-        "dem.sources", "dem.packing", "dem.experiment", "dem.scenes", "dem.stiffness", "dem.time_step", "dem.checks",
-        "dem.analysis",
+        "dem.scene", "dem.shapes", "dem.mesh", "dem.motion", "dem.contact_law", "dem.loads", "dem.springs",
+        "dem.joints", "dem.sources", "dem.packing", "dem.experiment", "dem.scenes", "dem.stiffness", "dem.time_step",
+        "dem.checks", "dem.analysis",
     ],
     "What a time step is made of": [
         "dem.start", "dem.world", "dem.bodies", "dem.contact", "dem.system", "dem.contact_map", "dem.step",

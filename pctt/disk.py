@@ -335,12 +335,12 @@ def _room(file: h5py.File, name: str, shape: tuple[int, ...], dtype: np.dtype) -
     return file.create_dataset(name, shape, dtype, dcpl=plan).id.get_offset()
 
 
-def read(path: Path, comm: MPI.Comm, take: Callable[[h5py.File, bool], Found]) -> Found:
-    """What ``take(file, sealed)`` takes of an HDF5 file on every rank, without calls of MPI; collective.
+def read(path: Path, comm: MPI.Comm, take: Callable[[h5py.File], Found], sealed: bool = True) -> Found:
+    """What ``take(file)`` takes of an HDF5 file on every rank, without calls of MPI; collective.
 
-    FileError on all ranks if a rank cannot read it, if the file is not as it was written, or if it leads to other
-    files. A file that is not ``sealed`` has no checksum, as those of earlier versions and of others. All is read from
-    one file, also if another one replaces it meanwhile."""
+    FileError on all ranks if a rank cannot read it, if the file is not as it was written, if it leads to other files,
+    or if it has no checksum, unless it need not be ``sealed``. All is read from one file, also if another one replaces
+    it meanwhile."""
     what = f"{path}: damaged, or no such file of this program"
 
     def look() -> tuple[int, bytes]:
@@ -351,7 +351,7 @@ def read(path: Path, comm: MPI.Comm, take: Callable[[h5py.File, bool], Found]) -
     def call() -> Found:
         with _as_hdf5(data, "r") as file:
             refuse_links(file)
-            return take(file, sealed)
+            return take(file)
 
     with ExitStack() as held:
         for _ in range(TRIES):  # until all ranks have the same file: two differ in their checksums
@@ -362,8 +362,10 @@ def read(path: Path, comm: MPI.Comm, take: Callable[[h5py.File, bool], Found]) -
                 break
         else:
             raise FileError(f"{what} (others replace it all the time)")
-        sealed = seal.startswith(SEAL)
-        if sealed and checksum(data, size, comm) != int.from_bytes(seal[8:], "little"):
+        if not seal.startswith(SEAL):
+            if sealed:
+                raise FileError(f"{what} (it has no checksum)")
+        elif checksum(data, size, comm) != int.from_bytes(seal[8:], "little"):
             raise FileError(f"{what} (it does not agree with its checksum)")
         return _together(what, comm, call)
 

@@ -239,12 +239,12 @@ class Folder:
         if not self.steps:
             raise FileError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
 
-        def take(file: h5py.File, sealed: bool) -> list[Any]:
+        def take(file: h5py.File) -> list[Any]:
             same_rows(file, TABLE[1:])
             forms = [file[name][()] if name in file else "[]" for name in ("clumps", "polyhedra")]
             return [*(file[name][()] for name in (*TABLE[1:], "materials", "large")), *forms]
 
-        found = disk.read(self.bodies_path, MPI.COMM_SELF, take)
+        found = disk.read(self.bodies_path, MPI.COMM_SELF, take, sealed=False)
         self.shape, self.size, self.mass, self.material = found[:4]
         #: names of the materials by their numbers; name and shapes of each large body, the rows after the grains
         self.materials: list[str] = [name.decode() for name in found[4]]
@@ -270,7 +270,7 @@ class Folder:
         if not hasattr(self, "large"):
             self.require_frames()
 
-        def take(file: h5py.File, sealed: bool) -> Frame:
+        def take(file: h5py.File) -> Frame:
             contact, names = file["contact"], ("body", "point", "frame", "gap", "impulse")
             same_rows(file, (f"contact/{name}" for name in (*names, "moment", "moved") if name in contact))
             rows = [contact[name][()] for name in names]
@@ -288,7 +288,7 @@ class Folder:
             cell = {name: file.attrs[name] for name in ("lattice", "drift", "rate") if name in file.attrs}
             return Frame(step, float(file.attrs["time"]), **places, contacts=contacts, table=table, **cell)
 
-        return disk.read(self.frame_path(step), MPI.COMM_SELF, take)
+        return disk.read(self.frame_path(step), MPI.COMM_SELF, take, sealed=False)
 
     def lines(self) -> list[dict[str, Any]]:
         """The figures of each step, in the order of the steps, from steps.jsonl; an empty list if the file is missing.

@@ -14,7 +14,8 @@ from contextlib import contextmanager
 
 from petsc4py import PETSc
 
-from pctt.options import OptionError, nearest, no_such_option
+from dem.checks import nearest
+from pctt.options import OptionError, no_such_option
 from pctt.petsc import is_used, options_database
 
 OWN = "ccp_"  #: Prefix of the project's own KSPs.

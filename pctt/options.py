@@ -7,13 +7,14 @@ A group of options is a frozen dataclass. The ``metadata`` of each field has ``h
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import numbers
 import sys
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
+
+from dem.checks import nearest
 
 Group = TypeVar("Group")
 
@@ -152,12 +153,6 @@ def _truth(text: str) -> bool:
     if text.lower() in ("0", "false", "no", "off"):
         return False
     raise ValueError(text)
-
-
-def nearest(name: str, known: Iterable[str], dash: str = "", alike: float = 0.6) -> str:
-    """The end of a message: the known name that the user may have meant, if the two are ``alike`` (of `difflib`)."""
-    close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=alike)
-    return f"; did you mean {dash}{close[0]}?" if close else ""
 
 
 def no_such_option(name: str, known: Iterable[str]) -> OptionError:

@@ -16,7 +16,7 @@ import dataclasses
 import html
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,12 @@ from mpi4py import MPI
 
 from dem import measures
 from dem import record as recording
-from dem.arrays import ArrayLike, Floats
+from dem.arrays import Floats
 from dem.bodies import Bodies
+from dem.changes import change, refuse_functions
 from dem.experiment import Experiment, Given
 from dem.impulses import ImpulseMemory
-from dem.loads import Load, On
+from dem.loads import Load
 from dem.measures import Sample
 from dem.mesh import Mesh
 from dem.motion import Motion
@@ -43,16 +44,6 @@ from dem.step import Step
 from dem.time_step import fall_remark, reason
 from dem.together import meet, together
 from dem.turns import TurnWatch
-from dem.world import (
-    set_load,
-    set_motion,
-    set_shear_rate,
-    set_source,
-    set_spring,
-    set_strain_rate,
-    set_stress,
-    set_surface,
-)
 from pctt import ccp, log
 from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
@@ -258,12 +249,6 @@ class Simulation:
         ValueError if there is none of that name. Not collective."""
         return self._passage("source", self.world.sources, name)
 
-    def set_source(self, name: str, **values: ArrayLike) -> None:
-        """Give a source another ``mass_rate`` [kg/s] or ``number_rate`` [1/s], 0 for none, or another ``velocity``
-        [m/s] from now on. The first rank's values count, and checkpoints keep them. ValueError for what it cannot
-        have."""
-        self._change(f"source {name}", set_source, name, **values)
-
     def outlet(self, name: str) -> Tally:
         """What has left by an outlet: ``count`` and ``mass`` [kg]. ValueError if there is none of that name. Not
         collective."""
@@ -351,19 +336,24 @@ class Simulation:
 
     @property
     def loads(self) -> dict[str, Load]:
-        """The loads by name; `set_load` changes them. Not collective."""
+        """The loads by name; `change` changes them. Not collective."""
         return dict(self.world.loads)
 
-    def set_load(self, name: str, on: On = None, **values: ArrayLike) -> None:
-        """Give a load other numbers, ``force=(0, 0, -5.0)`` [N], ``torque`` [N m], ``start`` or ``end`` [s]; or begin
-        one ``on`` a body, a material or ids of grains; nothing: all grains. The first rank's values count, and
-        checkpoints keep them. ValueError for what it cannot be (`dem.world.set_load`)."""
-        self._change(f"load {name}", set_load, name, on, **values)
+    def change(self, what: str, **values: Any) -> None:
+        """Give a load, spring, joint, source, large body or the cell other values from now on::
 
-    def set_shear_rate(self, rate: float) -> None:
-        """Shear the cell at another rate [1/s]. The first rank's value counts, and checkpoints keep it. ValueError if
-        the scene has no ``shear_rate``."""
-        self._change("shear rate", set_shear_rate, rate)
+            sim.change("load wind", force=(0, 0, -5.0))     # force, torque, start, end; with on=... it may begin
+            sim.change("spring tie", length=0.5)            # stiffness, damping, length
+            sim.change("joint boom", speed=-0.5)            # speed, target, strength, low, high
+            sim.change("source rain", mass_rate=0.5)        # mass_rate or number_rate, 0 shuts it; velocity
+            sim.change("body stirrer", speed=2.0)           # a parameter of its motion, motion=..., surface_velocity
+            sim.change("cell", stress=(None, None, 2e3))    # stress, strain_rate, shear_rate of a periodic one
+
+        The first rank's values count, and checkpoints keep them. ValueError for a name that is not there, and for what
+        it cannot have (`dem.changes.change`)."""
+        together(self.comm, what, partial(refuse_functions, what, values), own=(ValueError,))
+        values = self.comm.bcast(values)
+        together(self.comm, what, partial(change, self.world, what, **values), own=(ValueError, TypeError))
 
     @property
     def period(self) -> Floats | None:
@@ -371,27 +361,10 @@ class Simulation:
         collective."""
         return None if self.world.period is None else self.world.period.copy()
 
-    def set_stress(self, stress: Sequence[float | None]) -> None:
-        """Ask for other stresses (3,) of the cell along x, y, z, positive in compression [Pa]; None: none.
-        The first rank's values count, and checkpoints keep them. ValueError if the scene has neither ``stress`` nor
-        ``strain_rate``."""
-        self._change("stress", set_stress, stress)
-
-    def set_strain_rate(self, strain_rate: Sequence[float | None]) -> None:
-        """Compress the cell at other rates (3,) along x, y, z [1/s] from now on, in the place of a stress; None: it has
-        the stress that is asked for, or keeps its period. The first rank's values count, and checkpoints keep them.
-        ValueError if the scene has neither ``stress`` nor ``strain_rate``."""
-        self._change("strain rate", set_strain_rate, strain_rate)
-
     @property
     def springs(self) -> dict[str, Spring]:
-        """The springs by name; `set_spring` changes them. Not collective."""
+        """The springs by name; `change` changes them. Not collective."""
         return dict(self.world.springs)
-
-    def set_spring(self, name: str, **values: float) -> None:
-        """Give a spring another ``stiffness`` [N/m], ``damping`` [N s/m] or rest ``length`` [m]. The first rank's
-        values count, and checkpoints keep them. ValueError for what it cannot have."""
-        self._change(f"spring {name}", set_spring, name, **values)
 
     def spring_force(self, name: str) -> Floats:
         """Force (3,) of a spring on its second end, its mean over the last step [N]. ValueError before the first step,
@@ -402,12 +375,6 @@ class Simulation:
         """A joint: its force, torque, angle or position, speed and motor; ValueError if there is none of that name. Not
         collective."""
         return JointNow(self, name)
-
-    def _change(self, what: str, change: Callable[..., None], /, *given: Any, **values: Any) -> None:
-        """Call ``change(world, ...)`` with the first rank's values; collective."""
-        meet(self.comm, what)
-        given, values = self.comm.bcast((given, values))
-        together(self.comm, what, partial(change, self.world, *given, **values), own=(ValueError, TypeError))
 
     @property
     def _last(self) -> Step:
@@ -524,8 +491,10 @@ class Simulation:
 
 
 class Body:
-    """A large body of a simulation, as it is now. Vectors are in the world frame; nothing but the motion is
-    collective."""
+    """A large body of a simulation, as it is now. Vectors are in the world frame; what is not said to be collective is
+    not."""
+
+    __slots__ = ("_row", "_sim")
 
     def __init__(self, sim: Simulation, row: int):
         self._sim, self._row = sim, row
@@ -564,37 +533,9 @@ class Body:
         return self._sim._last.force_on(self.name)[3:]
 
     @property
-    def applied_force(self) -> Floats:
-        """Force (3,) that acts on it from now on at its centre of mass [N], beside gravity and the loads of the scene.
-        Set it on all ranks; checkpoints keep it. ValueError for a body whose motion is prescribed."""
-        return self._applied("force")
-
-    @applied_force.setter
-    def applied_force(self, force: ArrayLike) -> None:
-        self._sim.set_load(self.name, self.name, force=force)
-
-    @property
-    def applied_torque(self) -> Floats:
-        """As `applied_force` a torque (3,) [N m]."""
-        return self._applied("torque")
-
-    @applied_torque.setter
-    def applied_torque(self, torque: ArrayLike) -> None:
-        self._sim.set_load(self.name, self.name, torque=torque)
-
-    @property
     def surface_velocity(self) -> SurfaceVelocity | None:
-        """Velocity (3,) of its surface along itself in the body frame, that of a belt [m/s]; None: it has none. Set it
-        on all ranks; the first rank's value counts, and checkpoints keep it."""
+        """Velocity (3,) of its surface along itself in the body frame, that of a belt [m/s]; None: it has none."""
         return self._large.surface
-
-    @surface_velocity.setter
-    def surface_velocity(self, velocity: Sequence[float] | None) -> None:
-        self._sim._change(f"surface velocity of the body {self.name}", set_surface, self.name, velocity)
-
-    def _applied(self, name: str) -> Floats:
-        load = self._sim.world.loads.get(self.name)
-        return np.zeros(3) if load is None else np.array(getattr(load, name))
 
     def triangle_forces(self) -> Floats:
         """Forces (triangles, 3) on the triangles of a body that is one mesh, of the last step, each contact's on the
@@ -605,32 +546,6 @@ class Body:
         return measures.triangle_forces(sample, sample.count + self._row, mesh, self.position, self.orientation)
 
     @property
-    def motion(self) -> BodyMotion:
-        """How the body moves. Set a parameter, ``body.motion.speed = 2.0``, or another motion, ``body.motion =
-        Glide((0, 0, 1))``, on all ranks; the first rank's value counts. The body goes on from where it is, and
-        checkpoints keep the change. ValueError for what the body cannot do (`dem.world.set_motion`)."""
-        return BodyMotion(self)
-
-    @motion.setter
-    def motion(self, motion: Motion) -> None:
-        self._move(motion)
-
-    def _move(self, motion: Motion | None, **values: Any) -> None:
-        """Set the motion, or these parameters of the present one, as the first rank says."""
-        self._sim._change(f"motion of the body {self.name}", set_motion, self.name, motion, **values)
-
-
-class BodyMotion:
-    """The parameters of the motion of a body, to read and to set."""
-
-    def __init__(self, body: Body):
-        object.__setattr__(self, "_body", body)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._body._large.motion, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        self._body._move(None, **{name: value})
-
-    def __repr__(self) -> str:
-        return repr(self._body._large.motion)
+    def motion(self) -> Motion:
+        """How the body moves; `Simulation.change` changes it."""
+        return self._large.motion

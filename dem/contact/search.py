@@ -125,6 +125,10 @@ def find_contacts(
         near, grown = pictures.among(base), grown[pictures.rows]
     table = lists.table.now(near)
     i, j, reach = meeting(world, near, lists, table, delta, shifts, grown)
+    if not world.pairs.touching.all():
+        material = near.bodies.material[table.row]
+        touch = world.pairs.touching[material[i], material[j]] > 0.0
+        i, j, reach = i[touch], j[touch], reach[touch]
     table, i, j, reach = table.of_members(i, j, reach)
     moved: Floats | None = None
     swing: Floats | None = None

@@ -37,7 +37,7 @@ def main(picture: str = "", until: float = 3.0) -> tuple[float, float]:
         sim.step()
         most = np.maximum(most, np.abs([shoulder.drive, wrist.drive]))
         if sim.time > 0.5 * until and shoulder.motor.speed > 0:
-            shoulder.motor.speed = -0.3  # it lifts
+            sim.change("joint shoulder", speed=-0.3)  # it lifts
             if picture:
                 sim.render(elevation=10, width=640, height=480).save(picture)
     print(f"angles {shoulder.angle:.3f} and {wrist.angle:.3f} rad")

@@ -73,11 +73,11 @@ def load(path: str | os.PathLike[str], comm: MPI.Comm | PETSc.Comm | None = None
     return mat_of(matrix, Options(values["eps"], values["max_rank"]))
 
 
-def _taken(file: h5py.File, sealed: bool) -> tuple[dict[str, Any], Train, np.ndarray | None]:
+def _taken(file: h5py.File) -> tuple[dict[str, Any], Train, np.ndarray | None]:
     """The attributes as Python numbers, the train and the rows."""
     values = {name: _plain(value) for name, value in file.attrs.items()}
-    if values.get("format") != FORMAT or not sealed:
-        raise ValueError(f"it is not marked '{FORMAT}', or has no checksum")
+    if values.get("format") != FORMAT:
+        raise ValueError(f"it is not marked '{FORMAT}'")
     train = Train([file[f"cores/{k}"][()] for k in range(len(file["cores"]))])
     rows, digits = file["rows"][()] if "rows" in file else None, GridDigits(values["grid"], values["block"])
     if not train.rows == train.columns == tuple(digits.modes):

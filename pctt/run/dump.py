@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from dem.contact_law import ContactLaw
 from dem.contact_map import ContactMap, root_blocks
 from dem.contact_map.map import packed
 from dem.exchange import offsets
 from dem.experiment import Experiment
 from dem.joints import Joint
-from dem.pairs import Pairs
 from dem.system import ContactSystem
 from dem.world import World
 from pctt import ccp
@@ -131,7 +131,7 @@ class Dump:
         return path
 
 
-def unwritten(pairs: Pairs, joints: dict[str, Joint], deforms: bool) -> str:
+def unwritten(pairs: ContactLaw, joints: dict[str, Joint], deforms: bool) -> str:
     """Why problems of a scene with these pairs and joints, or whose cell `deforms`, cannot be written, in words; "" if
     they can."""
     if pairs.resists:  # FCLIB's files have a format of their own for these

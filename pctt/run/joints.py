@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,12 +9,13 @@ import numpy as np
 from dem.applied import joint_ends
 from dem.arrays import Floats
 from dem.joints import HOLDS, Geometry, Joint, geometry
-from dem.together import meet, together
-from dem.world import set_joint
+from dem.together import meet
 
 
 class JointNow:
     """A joint of a simulation. Its members are collective; vectors are in the world frame."""
+
+    __slots__ = ("_number", "_sim", "name")
 
     def __init__(self, sim: Any, name: str):
         if name not in sim.world.joints:
@@ -68,10 +68,11 @@ class JointNow:
         return float(velocity[joint.way])
 
     @property
-    def motor(self) -> Motor:
-        """The motor, whose ``speed``, ``target``, ``strength``, ``low`` and ``high`` can be set on all ranks; the first
-        rank's value counts, and checkpoints keep it."""
-        return Motor(self)
+    def motor(self) -> Joint:
+        """The ``speed``, ``target``, ``strength``, ``low`` and ``high`` of the motor and the limits, to read; not
+        collective."""
+        joint: Joint = self._sim.world.joints[self.name]
+        return joint
 
     def _coordinate(self, kind: str) -> float:
         joint, found, _ = self._now
@@ -91,19 +92,3 @@ class JointNow:
     def _mean(self, part: slice) -> Floats:
         axes: Floats = self._sim._last.system.joints.axes[self._number]
         return self._impulses[part] @ axes / self._sim.settings.dt
-
-
-class Motor:
-    """The numbers of the motor and the limits of a joint, to read and to set."""
-
-    def __init__(self, joint: JointNow):
-        object.__setattr__(self, "_joint", joint)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._joint._sim.world.joints[self._joint.name], name)
-
-    def __setattr__(self, name: str, value: float | None) -> None:
-        sim, what = self._joint._sim, f"joint {self._joint.name}"
-        meet(sim.comm, what)
-        change = partial(set_joint, sim.world, self._joint.name, **sim.comm.bcast({name: value}))
-        together(sim.comm, what, change, own=(ValueError, TypeError))

@@ -17,12 +17,10 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from dem import joints, loads, sources, springs, stiffness, time_step
-from dem.arrays import Floats, Keys
+from dem import stiffness, time_step
+from dem.arrays import Floats
 from dem.bodies import Bodies
-from dem.contact.clumps import more_numbers
-from dem.contact.polyhedra import hulls_of
-from dem.contact.primitives import numbers_of
+from dem.changes import changes, restore
 from dem.exchange import refuse
 from dem.experiment import Experiment
 from dem.impulses import ImpulseMemory
@@ -32,15 +30,7 @@ from dem.scene import LargeBody, Scene
 from dem.shapes import placed
 from dem.start import even_slice, new_world, restart_rows, restored_world
 from dem.together import SceneError, together, unlike
-from dem.world import (
-    World,
-    changed_motions,
-    restore_joints,
-    restore_loads,
-    restore_motions,
-    restore_sources,
-    restore_springs,
-)
+from dem.world import World
 from pctt import ccp
 from pctt.disk import FileError, Lock, on_first, read, same_rows, texts, write_rows
 from pctt.options import OptionError
@@ -49,14 +39,8 @@ from pctt.run import interrupt
 from pctt.run.settings import Settings, scene_name
 from pctt.run.stepper import Stepper
 
-#: Made within a run.
-CHANGES = {
-    "motions": restore_motions, "loads": restore_loads, "springs": restore_springs, "joints": restore_joints,
-    "sources": restore_sources,
-}  # fmt: skip
 CONTACTS = ("contacts/key", "contacts/impulse")  #: the data sets that have a row for each contact
-#: The third has keys of two numbers. The first one had no checksums.
-FORMAT, SECOND_FORMAT, FIRST_FORMAT = (f"pctt checkpoint {number}" for number in (3, 2, 1))
+FORMAT = "pctt checkpoint 4"
 
 Say = Callable[[str], object]  #: told on the first rank
 
@@ -153,17 +137,7 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
     rows = {f"grains/{name}": column for name, column in local.items()}
     shared = {f"world/{name}": array for name, array in replicated.items()}
     shared["world/materials"] = texts(world.materials)
-    if motions := changed_motions(world):
-        shared["world/motions"] = texts([motions])
-    if world.loads_set:
-        shared["world/loads"] = texts([loads.as_text({name: world.loads[name] for name in sorted(world.loads_set)})])
-    if world.springs_set:
-        changed = {name: world.springs[name] for name in sorted(world.springs_set)}
-        shared["world/springs"] = texts([springs.as_text(changed)])
-    if world.joints_set:
-        shared["world/joints"] = texts([joints.as_text({n: world.joints[n] for n in sorted(world.joints_set)})])
-    if world.sources_set:
-        shared["world/sources"] = texts([sources.as_text({n: world.sources[n] for n in sorted(world.sources_set)})])
+    shared["world/changes"] = texts([changes(world)])
     rows |= {"contacts/key": key, "contacts/impulse": impulse}
     write_rows(path, world.comm, rows, shared, {"/": {"format": FORMAT, **made_with}})
 
@@ -177,54 +151,37 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
     """
     columns = [field.name for field in dataclasses.fields(Bodies)]
 
-    def take(file: h5py.File, sealed: bool) -> tuple[Any, ...]:
-        _refuse_unmarked(file, sealed)
+    def take(file: h5py.File) -> tuple[Any, ...]:
+        _refuse_other_format(file)
         same_rows(file, (f"world/large_{name}" for name in columns))
         count, number = same_rows(file, (f"grains/{name}" for name in columns)), same_rows(file, CONTACTS)
-        replicated = {n: file[f"world/{n}"][()] for n in (*(f"large_{n}" for n in columns), "slabs", "time", "step")}
-        # of springs, of sources and outlets, of a sheared cell, of its stress; not in files of earlier versions
-        for name in {"spare", "expected", "tallies", "shear", "servo"} & set(file["world"]):
-            replicated[name] = file[f"world/{name}"][()]
-        changes = [file[f"world/{n}"].asstr()[0] if f"world/{n}" in file else "{}" for n in CHANGES]
+        replicated = {name: file[f"world/{name}"][()] for name in file["world"]}
         _refuse_other_slabs(replicated["slabs"], count)
         rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(number, comm)
         local = {name: file[f"grains/{name}"][rows] for name in columns}
-        old = {name: file.attrs.get(name) for name in made_with}
+        changed = replicated.pop("changes")[0].decode()
+        old = {name: file.attrs[name] for name in made_with}
         impulses = tuple(file[name][contacts] for name in CONTACTS)
-        return old, json.loads(file.attrs["scene"]), replicated, changes, local, impulses
+        return old, json.loads(file.attrs["scene"]), replicated, changed, local, impulses
 
-    old, scene_of, replicated, changes, local, impulses = read(path, comm, take)
+    old, scene_of, replicated, changed, local, impulses = read(path, comm, take)
     _refuse_other_origin(path, old, scene_of, made_with, comm)
     try:
         world = restored_world(scene, comm, local, replicated)
-        for restore, text in zip(CHANGES.values(), changes):
-            restore(world, text)
+        restore(world, changed)
         memory, (key, impulse) = ImpulseMemory(comm, world.pairs.parts), impulses
-        if key.dtype.kind != "c":
-            key = _keys_of_before(key, world)
         right = np.isfinite(impulse).all() and impulse.shape == (len(key), 4 * world.pairs.parts)
         right = right and len(np.unique(key)) == len(key)
         refuse(comm, "" if right else "impulses of contacts that are no numbers, or two of one contact")
     except (AttributeError, KeyError, TypeError, ValueError) as error:  # of another scene file
         raise OptionError(f"-restart {path}: {error}") from None
-    memory.restore(key, impulse if old["dt"] in (None, made_with["dt"]) else impulse * (made_with["dt"] / old["dt"]))
+    memory.restore(key, impulse if old["dt"] == made_with["dt"] else impulse * (made_with["dt"] / old["dt"]))
     return world, memory
 
 
-def _keys_of_before(key: np.ndarray, world: World) -> Keys:
-    """The keys of contacts in files of the first two formats, which have them as one number of 64 bits."""
-    first = 10**8 if world.sources else world.first_large  # number of the first part of a large body
-    features = hulls_of(()).features  # there were no polyhedra but boxes
-    parts = sum(numbers_of(shape, features) for body in world.large_bodies for shape in body.shapes)
-    pair, feature = np.divmod(key, features)
-    both = np.array(np.divmod(pair, first + parts + more_numbers(world.clumps, world.initial)))
-    one, two = np.where(both < first, both, both - first + world.first_large)
-    return one + 1j * (two * features + feature)
-
-
-def _refuse_unmarked(file: h5py.File, sealed: bool) -> None:
-    if (file.attrs.get("format"), sealed) not in ((FORMAT, True), (SECOND_FORMAT, True), (FIRST_FORMAT, False)):
-        raise ValueError(f"it is not marked '{FORMAT}', or has no checksum")
+def _refuse_other_format(file: h5py.File) -> None:
+    if (found := file.attrs.get("format")) != FORMAT:
+        raise ValueError(f"its format is {found!r}; allowed is {FORMAT!r}")
 
 
 def _refuse_other_slabs(slabs: np.ndarray, count: int) -> None:
@@ -237,18 +194,17 @@ def _refuse_other_slabs(slabs: np.ndarray, count: int) -> None:
 def _refuse_other_origin(
     path: Path, old: dict[str, Any], old_scene: dict[str, Any], new: dict[str, Any], comm: MPI.Comm
 ) -> None:
-    """OptionError for the first option in which two origins differ, and warnings of what else does. Checkpoints of
-    earlier versions lack some properties."""
+    """OptionError for the first option in which two origins differ, and warnings of what else does."""
     new_scene = json.loads(new["scene"])
     pairs = [("-scene", old_scene["scene"], new_scene["scene"])]
     absent = "(no such option)"
     names = [name for name in {**new_scene, **old_scene} if name != "scene"]
     pairs += [(f"-scene_{name}", old_scene.get(name, absent), new_scene.get(name, absent)) for name in names]
     for option, was, now in pairs:
-        if was is not None and was != now:
+        if was != now:
             raise OptionError(f"{option} {now}: {path} was made with {option} {was}; allowed is the same")
     for name, what in {"scene_file": "another text of the scene file", "surfaces": "other surfaces of bodies"}.items():
-        if old[name] not in (None, new[name]):
+        if old[name] != new[name]:
             warn(comm, f"{path} was made with {what}: {old[name][:200] or 'none'}, now {new[name][:200] or 'none'}")
 
 
@@ -300,7 +256,7 @@ def settled_state(
     path = comm.bcast(settled_path(experiment, settings, scene, made_with))  # processors may round in other ways
     if not anew and comm.bcast(path.exists()):
         try:
-            read(path, comm, _refuse_unmarked)
+            read(path, comm, _refuse_other_format)
             return path
         except FileError as error:
             say(f"{error}; it is made anew")

@@ -89,7 +89,7 @@ def flow(at_rest: bool = False, constant: bool = False) -> pctt.Simulation:
     sim = simulation(PlaneShear(n=6, fraction=0.5, inertial=0.1, seed=3), dt=None)
     sim.run(steps=200)
     if at_rest:
-        sim.set_shear_rate(0.0)
+        sim.change("cell", shear_rate=0.0)
     if constant:
         sim.world.servo = None
     return sim

@@ -83,13 +83,13 @@ def test_a_held_body_takes_other_values_without_a_jump_and_keeps_them_in_checkpo
     sim.run(steps=10)
     wheel = sim.body("wheel")
     before = wheel.orientation
-    wheel.motion.angular_velocity = (0, -1.0, 0)
-    wheel.applied_force = (0.1, 0, 0)
+    sim.change("body wheel", angular_velocity=(0, -1.0, 0))
+    sim.change("load tug", on="wheel", force=(0.1, 0, 0))
     sim.step()
     turned = quaternion.rotation_vector(before, wheel.orientation)
     np.testing.assert_allclose(turned, [0, -DT, 0], atol=1e-13)
     with pytest.raises(ValueError, match="cannot change its motion"):
-        wheel.motion.velocity = (0.1, 0, None)
+        sim.change("body wheel", velocity=(0.1, 0, None))
     sim.save(tmp_path / "state.h5")
     again = pctt.Simulation.load(
         tmp_path / "state.h5", scene, dt=DT, delta=0.01, solver="apgd", tol=1e-9, comm=SELF
@@ -175,7 +175,7 @@ def test_a_belt_changes_its_speed_within_the_loop_and_keeps_it_in_checkpoints(tm
     sim = simulation(scene, WORLD)
     sim.run(steps=40)
     np.testing.assert_allclose(sim.velocities[0, 0], 0.2, rtol=1e-6)
-    sim.body("belt").surface_velocity = (0, -0.1 - WORLD.rank, 0)
+    sim.change("body belt", surface_velocity=(0, -0.1 - WORLD.rank, 0))
     sim.run(steps=10)
     sim.save(tmp_path / "state.h5")
     settings = {"dt": DT, "delta": 0.01, "solver": "apgd", "tol": 1e-9}
@@ -193,8 +193,8 @@ def test_bad_surface_velocities_are_refused():
     sim = simulation(on_belt(lambda place, normal: np.zeros(2)))
     with pytest.raises(SceneError, match="surface velocity of 'belt' must have shape"):
         sim.step()
-    with pytest.raises(ValueError, match="a function is the scene's"):
-        sim.body("belt").surface_velocity = np.sin
+    with pytest.raises(ValueError, match="a function comes from the scene"):
+        sim.change("body belt", surface_velocity=np.sin)
 
 
 # -- the rig ------------------------------------------------------------------------------------------------

@@ -7,11 +7,11 @@ import pytest
 from mpi4py import MPI
 
 from dem import quaternion
+from dem.changes import changes, restore
 from dem.motion import Fixed, Glide, Guided, Oscillation, Path, Rotation, checked_pose, mean_velocity, refuse_ignored
 from dem.scene import Scene
 from dem.shapes import Box
 from dem.start import new_world
-from dem.world import changed_motions, restore_motions
 
 PLACE, TURN = np.array([1.0, 2.0, 3.0]), quaternion.normalized(np.array([1.0, 0.5, 0.0, 0.2]))
 MOTIONS = [Fixed(), Rotation((0.1, 0.0, 1.0), (2.0, 0.0, 0.0)), Oscillation((1.0, 2.0, 0.0), 0.3, 4.0, 0.7)]
@@ -173,13 +173,13 @@ GOOD |= {"position": [1, 2, 4], "quaternion": [0.0, 1.0, 0.0, 0.0], "surface": [
 
 def test_a_motion_from_text_is_that_of_the_body():
     world = tools()
-    restore_motions(world, json.dumps({"tool": GOOD}))
+    restore(world, json.dumps({"body": {"tool": GOOD}}))
     (tool, lid), again = world.large_bodies, tools()
     assert tool.motion == Rotation((0, 0, 2.0))
     assert (tool.position.tolist(), tool.quaternion.tolist()) == ([1, 2, 4], [0, 1, 0, 0])
     assert tool.surface == (0.5, 0.0, 0.0)
     assert lid.motion == Guided((0, 0, 1))
-    restore_motions(again, changed_motions(world))
+    restore(again, changes(world))
     assert again.large_bodies[0].motion == tool.motion
 
 
@@ -205,11 +205,11 @@ STRANGE = {
 def test_what_is_no_motion_is_refused(what):
     world = tools()
     with pytest.raises((TypeError, ValueError)):
-        restore_motions(world, json.dumps({"tool": {**GOOD, **STRANGE[what]}}))
+        restore(world, json.dumps({"body": {"tool": {**GOOD, **STRANGE[what]}}}))
     assert world.large_bodies[0].motion == Glide((1, 0, 0))
 
 
 def test_another_guide_is_refused():
     other = {**GOOD, "motion": "Guided", "values": {"direction": [1, 0, 0]}}
     with pytest.raises(ValueError, match="'lid' cannot change its motion"):
-        restore_motions(tools(), json.dumps({"lid": other}))
+        restore(tools(), json.dumps({"body": {"lid": other}}))

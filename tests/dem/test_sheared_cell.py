@@ -13,7 +13,7 @@ CELL, RATE = (0.9, 1.1, 1.3), 1.5
 
 def collision(shift, gradient, capsules=False):
     """Two grains that collide obliquely in a sheared cell."""
-    scene = Scene(0.4, (0.0, 0.0, 0.0), np.inf, period=CELL, shear_rate=RATE, shear_gradient=gradient)
+    scene = Scene(0.4, (0.0, 0.0, 0.0), stiffness=np.inf, period=CELL, shear_rate=RATE, shear_gradient=gradient)
     place = np.array([[0.45, 0.5, 0.6], [0.56, 0.53, 0.61]]) + shift
     speed = np.array([[0.8, 0.0, 0.2], [-0.5, 0.1, 0.0]])
     if capsules:
@@ -64,7 +64,8 @@ def test_affine_flow_keeps_its_profile():
 
 def sheared(comm=MPI.COMM_SELF, rate=3.0):
     """A dense cell of spheres."""
-    scene = Scene(0.5, (0.0, 0.0, 0.0), np.inf, period=(0.32, 0.328, 0.32), shear_rate=rate, shear_gradient="z")
+    shear = {"period": (0.32, 0.328, 0.32), "shear_rate": rate, "shear_gradient": "z"}
+    scene = Scene(0.5, (0.0, 0.0, 0.0), stiffness=np.inf, **shear)
     grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
     place = grid * [0.08, 0.082, 0.08] + np.random.default_rng(3).uniform(-0.0004, 0.0004, grid.shape)
     speed = np.stack([rate * place[:, 2], 0.0 * place[:, 2], 0.0 * place[:, 2]], axis=1)
@@ -124,7 +125,7 @@ def test_kept_lists_find_what_new_ones_find():
 def test_restart_goes_on_with_the_same_bits(tmp_path):
     sim = sheared(MPI.COMM_WORLD)
     sim.run(steps=6)
-    sim.set_shear_rate(-2.0)
+    sim.change("cell", shear_rate=-2.0)
     sim.run(steps=3)
     sim.save(tmp_path / "state.h5")
     more = {"dt": 0.002, "solver": "apgd", "tol": 1e-7}
@@ -150,4 +151,4 @@ def test_refused():
     scene = Scene(0.3, period=(0.5, 0.5, None))
     scene.add_spheres([[0.1, 0.1, 0.1]], radius=0.05, density=1000.0)
     with pytest.raises(ValueError, match="is not sheared"):
-        pctt.Simulation(scene, dt=0.01).set_shear_rate(1.0)
+        pctt.Simulation(scene, dt=0.01).change("cell", shear_rate=1.0)

@@ -90,10 +90,8 @@ def test_a_changed_rate_counts_from_its_time_on_and_keeps_what_was_due():
     early, late = (first.changed(time, Tally(), number_rate=20.0) for time in (0.5, 9.0))
     assert [early.amount(time) for time in (1.0, 2.0)] == pytest.approx([0, 20])
     assert late.amount(9.0) == pytest.approx(20)
-    for words, values in {"radius of a source cannot be set": {"radius": 1.0},
-                          "either a mass_rate": {"mass_rate": 1.0, "number_rate": 1.0}}.items():  # fmt: skip
-        with pytest.raises(ValueError, match=words):
-            first.changed(2.0, tally, **values)
+    with pytest.raises(ValueError, match="either a mass_rate"):
+        first.changed(2.0, tally, mass_rate=1.0, number_rate=1.0)
 
 
 def test_spheres_go_to_their_first_free_place_and_the_queue_stops_at_the_first_without():

@@ -118,11 +118,10 @@ def test_anchors_turn_with_their_bodies():
     anchors = {"anchor": (0.1, 0.1, 0.1), "other_anchor": (1, 2, 4)}
     scene.add_spring("rope", "box", stiffness=1e3, damping=20.0, length=0.5, **anchors)
     sim = simulation(scene, 0.01)
-    sim.set_load("drag", on="box", force=(0, 0, 0))
     box = sim.body("box")
     for _ in range(360):
         sim.step()
-        box.applied_force, box.applied_torque = -10.0 * box.velocity[:3], -0.2 * box.velocity[3:]
+        sim.change("load drag", on="box", force=-10.0 * box.velocity[:3], torque=-0.2 * box.velocity[3:])
     np.testing.assert_allclose(sim.spring_force("rope"), [0, 0, 2.0 * -9.81], atol=1e-2)
     np.testing.assert_allclose(box.position, [1, 2, 4 - 0.5 - 2.0 * 9.81 / 1e3 - 0.1 * np.sqrt(3)], atol=1e-3)
 
@@ -184,7 +183,7 @@ def test_springs_are_the_same_on_any_ranks_and_after_a_restart(tmp_path):
     one, alone = make(WORLD), make(SELF)
     for sim in (one, alone):
         sim.run(steps=5)
-        sim.set_spring("top", length=0.1 + sim.comm.rank, damping=3.0)
+        sim.change("spring top", length=0.1 + sim.comm.rank, damping=3.0)
         sim.run(steps=5)
     np.testing.assert_allclose(one.positions, WORLD.bcast(alone.positions), atol=1e-6)
     one.save(tmp_path / "state.h5")
@@ -228,4 +227,4 @@ def test_what_is_no_spring_is_refused(given, words):
 def test_only_the_numbers_of_springs_can_be_set():
     sim = simulation(balls([0, 0, 0]), 0.01)
     with pytest.raises(ValueError, match="no spring 'a'; there are: none"):
-        sim.set_spring("a", length=1.0)
+        sim.change("spring a", length=1.0)

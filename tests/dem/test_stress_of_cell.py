@@ -19,7 +19,9 @@ OF_RUNS = {"dt": 0.001, "solver": "apgd", "tol": 1e-6}
 def packed(comm=MPI.COMM_SELF, stress=(PRESSURE,) * 3, capsules=False, sheared=False, **more):
     """A dense cell of 64 grains, a little moved and turned from a lattice; contacts close to it."""
     shear = {"shear_rate": 2.0, "shear_gradient": "z"} if sheared else {}
-    scene = Scene(0.4, (0.0, 0.0, 0.0), 27000.0, period=(0.0404, 0.0408, 0.0402), stress=stress, **shear, **more)
+    scene = Scene(
+        0.4, (0.0, 0.0, 0.0), stiffness=27000.0, period=(0.0404, 0.0408, 0.0402), stress=stress, **shear, **more
+    )
     random = np.random.default_rng(3)
     grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
     place = grid * [0.0101, 0.0102, 0.01005] + random.uniform(-4e-5, 4e-5, grid.shape)
@@ -50,10 +52,10 @@ def test_isotropic_cell_reaches_its_stress_and_stays():
     assert max(late) < 0.02
     assert sim.period.prod() < 0.0404 * 0.0408 * 0.0402
     asked = np.array([1.0, 1.0, 1.2]) * PRESSURE
-    sim.set_stress(asked)
+    sim.change("cell", stress=asked)
     sim.run(steps=200, stop=lambda sim: error(sim, asked) < 0.01)
     assert error(sim, asked) < 0.01
-    sim.set_stress((None, None, 2.0 * PRESSURE))
+    sim.change("cell", stress=(None, None, 2.0 * PRESSURE))
     before = sim.period
     sim.run(steps=3)
     np.testing.assert_array_equal(sim.period[:2], before[:2])
@@ -61,7 +63,7 @@ def test_isotropic_cell_reaches_its_stress_and_stays():
 
 def test_loose_cell_closes_affinely():
     """Grains that touch nothing keep their places relative to the cell, and their velocities beside it."""
-    scene = Scene(0.4, (0.0, 0.0, 0.0), 1e4, period=(0.1, 0.1, 0.1), stress=(None, None, PRESSURE))
+    scene = Scene(0.4, (0.0, 0.0, 0.0), stiffness=1e4, period=(0.1, 0.1, 0.1), stress=(None, None, PRESSURE))
     place = np.array([[0.02, 0.03, 0.01], [0.05, 0.06, 0.05], [0.07, 0.05, 0.09]])
     scene.add_spheres(place, 0.005, 2500.0)
     sim = pctt.Simulation(scene, **OF_RUNS)
@@ -74,7 +76,7 @@ def test_loose_cell_closes_affinely():
 
 def lattice(start=0.0, strain_rate=None):
     """A simple cubic lattice of spheres that just touch."""
-    scene = Scene(0.3, (0.0, 0.0, 0.0), 1e4, period=(0.04, 0.04, 0.05), stress=(PRESSURE,) * 3,
+    scene = Scene(0.3, (0.0, 0.0, 0.0), stiffness=1e4, period=(0.04, 0.04, 0.05), stress=(PRESSURE,) * 3,
                   strain_rate=strain_rate, strain_start=start)  # fmt: skip
     grid = np.stack(np.meshgrid(range(4), range(4), range(5), indexing="ij"), axis=-1).reshape(-1, 3)
     scene.add_spheres(0.01 * grid, 0.005, 2500.0)
@@ -99,7 +101,7 @@ def test_strain_rate_takes_the_place_of_the_stress():
     sim.run(steps=10)
     assert sim.period[2] == pytest.approx(before[2] * (1.0 - 0.001 * 0.5) ** 10, rel=1e-12)
     np.testing.assert_allclose(stress(sim)[:2], PRESSURE, rtol=2e-3)
-    sim.set_strain_rate((None, -0.5, 0.0))
+    sim.change("cell", strain_rate=(None, -0.5, 0.0))
     then = sim.period
     sim.run(steps=5)
     assert sim.period[1] == pytest.approx(then[1] * (1.0 + 0.001 * 0.5) ** 5, rel=1e-12)
@@ -229,7 +231,7 @@ def of_motion(sim):
 def test_restart_goes_on_with_the_same_bits(tmp_path):
     sim = packed(MPI.COMM_WORLD, (PRESSURE, None, PRESSURE), sheared=True)
     sim.run(steps=6)
-    sim.set_stress((PRESSURE, 2.0 * PRESSURE, PRESSURE))
+    sim.change("cell", stress=(PRESSURE, 2.0 * PRESSURE, PRESSURE))
     sim.run(steps=3)
     sim.save(tmp_path / "state.h5")
     other = pctt.Simulation.load(tmp_path / "state.h5", sim.experiment, comm=MPI.COMM_WORLD, **OF_RUNS)
@@ -274,8 +276,8 @@ def test_refused():
         walled.grains()
     with pytest.raises(ValueError, match="contacts that give way"):
         pctt.Simulation(scene(stiffness=np.inf), dt=0.01)
-    with pytest.raises(ValueError, match="periods of this scene are constant"):
-        pctt.Simulation(scene(stress=None), dt=0.01).set_stress((None, None, 1e3))
+    with pytest.raises(ValueError, match="periods of this cell are constant"):
+        pctt.Simulation(scene(stress=None), dt=0.01).change("cell", stress=(None, None, 1e3))
 
 
 @pytest.mark.slow

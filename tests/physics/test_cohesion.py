@@ -8,7 +8,6 @@ import pctt
 from dem.record import energy_balance
 from dem.scene import Scene
 from dem.shapes import Plane
-from dem.together import SceneError
 from pctt import ccp
 from pctt.options import OptionError
 
@@ -54,8 +53,8 @@ def test_attraction_ends_with_its_range():
             np.testing.assert_allclose(sim.velocities[0, 2], (pull - 1.0) * G * 5e-3, rtol=1e-9)
     with pytest.raises(OptionError, match="cohesion acts up to 0.01 m"):
         pctt.Simulation(hanging(1, 1.0), delta=0.005)
-    with pytest.raises(SceneError, match="needs a cohesion_range"):
-        pctt.Simulation(hanging(1, 1.0, reach=0.0))
+    with pytest.raises(ValueError, match="needs a cohesion_range"):
+        hanging(1, 1.0, reach=0.0)
 
 
 @pytest.mark.parametrize("dt", [0.02, 0.005])

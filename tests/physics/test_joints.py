@@ -168,10 +168,10 @@ def test_a_motor_keeps_its_speed_and_is_changed_within_the_loop():
     sim.run(until=0.1)
     assert sim.joint("axle").speed == pytest.approx(3.0)
     assert sim.joint("axle").angle == pytest.approx(0.3)
-    sim.joint("axle").motor.speed = -1.0
+    sim.change("joint axle", speed=-1.0)
     sim.run(until=0.2)
     assert sim.joint("axle").angle == pytest.approx(0.2)
-    sim.joint("axle").motor.target = 0.5
+    sim.change("joint axle", target=0.5)
     sim.step()
     assert sim.joint("axle").angle == pytest.approx(0.5)
     assert sim.joint("axle").motor.speed is None
@@ -375,7 +375,7 @@ def test_a_motor_presses_a_head_on_the_floor_with_the_force_of_the_closed_form()
     moment = (4.0 * 0.5 + mass * 1.15) * G * np.cos(angle)
     bears = (100.0 + moment) / (1.15 * np.cos(angle))
     assert -sim.body("floor").force[2] == pytest.approx(bears, rel=2e-3)
-    sim.joint("shoulder").motor.speed = -0.2
+    sim.change("joint shoulder", speed=-0.2)
     sim.run(until=3.0)
     assert sim.joint("shoulder").angle == pytest.approx(-0.3, abs=1e-9)
 
@@ -468,7 +468,7 @@ def pusher():
 def test_a_restart_goes_on_with_the_same_bits(tmp_path):
     sim = simulation(pusher(), dt=0.01)
     sim.run(steps=20)
-    sim.joint("pin").motor.speed = 0.5
+    sim.change("joint pin", speed=0.5)
     sim.save(tmp_path / "state.h5")
     sim.run(steps=20)
     again = pctt.Simulation.load(tmp_path / "state.h5", pusher(), dt=0.01, tol=1e-9, comm=MPI.COMM_SELF)

@@ -242,9 +242,9 @@ def test_a_source_that_was_set_goes_on_after_a_restart(tmp_path):
     comm = MPI.COMM_WORLD
     sim = Simulation(chute(), comm=comm, **WORDS)
     sim.run(steps=20)
-    sim.set_source("rain", number_rate=500.0, velocity=(0.0, 0.0, -1.0))
+    sim.change("source rain", number_rate=500.0, velocity=(0.0, 0.0, -1.0))
     with pytest.raises(ValueError, match="no source 'snow'; there are: rain"):
-        sim.set_source("snow", number_rate=1.0)
+        sim.change("source snow", number_rate=1.0)
     came = sim.source("rain").count
     sim.run(steps=10)
     assert came + 9 <= sim.source("rain").count <= came + 10
@@ -257,7 +257,7 @@ def test_a_source_that_was_set_goes_on_after_a_restart(tmp_path):
         np.testing.assert_array_equal(column, other[name])
     assert vars(sim.source("rain")) == vars(again.source("rain"))
     count = sim.source("rain").count
-    sim.set_source("rain", number_rate=0.0)
+    sim.change("source rain", number_rate=0.0)
     sim.run(steps=20)
     assert sim.source("rain").count <= count + 1
 
@@ -275,7 +275,7 @@ def test_a_hopper_fills_and_runs_out():
     sim.run(until=0.7)
     assert len(sim.ids) == 60
     assert sim.positions[:, 2].min() > 0.0
-    sim.body("gate").motion = Glide((0, 0, -5.0), start=sim.time)
+    sim.change("body gate", motion=Glide((0, 0, -5.0), start=sim.time))
     sim.run(until=sim.time + 1.5, stop=lambda sim: len(sim.ids) == 0)
     assert sim.outlet("below").count == 60
     assert sim.outlet("below").mass == pytest.approx(sim.source("rain").mass, rel=1e-12)

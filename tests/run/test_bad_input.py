@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from program import DROP, SETTLED, SMALL, contents, database, one_line, steps_of, summary_of
+from sealed import edited
 
 from pctt.options import OptionError
 from pctt.run.options import read_options
@@ -241,8 +242,7 @@ def damaged(path, how, checkpoint):
             file["fclib_local/vectors/mu"] = np.ones(1)
             file["fclib_local/spacedim"] = 3
     elif how in ("grains", "grains/velocity", "scene"):
-        with h5py.File(path, "a") as file:  # which loses its checksum
-            file.attrs["format"] = "pctt checkpoint 1"
+        with edited(path) as file:
             del (file.attrs if how in file.attrs else file)[how]
 
 

@@ -49,8 +49,7 @@ def test_rows_of_any_size_are_written_with_their_checksum(tmp_path):
         "none": np.zeros((0, 2)),
     }
     disk.write_rows(tmp_path / "file.h5", comm, rows, {"shared": np.arange(3)}, {"/": {"about": "it"}})
-    found, sealed = disk.read(tmp_path / "file.h5", comm, lambda file, sealed: ({n: file[n][()] for n in rows}, sealed))
-    assert sealed
+    found = disk.read(tmp_path / "file.h5", comm, lambda file: {n: file[n][()] for n in rows})
     for name, local in rows.items():
         np.testing.assert_array_equal(found[name], np.concatenate(comm.allgather(local)))
 
@@ -62,8 +61,7 @@ def save(path, value):
     disk.write_rows(path, MPI.COMM_SELF, {"row": np.full(1000, value)}, {}, {})
 
 
-def row(file, sealed):
-    assert sealed
+def row(file):
     return file["row"][()]
 
 
@@ -91,9 +89,9 @@ def test_a_writer_that_fails_spares_the_other(tmp_path):
 def test_a_file_that_is_replaced_while_it_is_read_is_read_as_it_was(tmp_path):
     save(tmp_path / "file.h5", 1.0)
 
-    def take(file, sealed):
+    def take(file):
         save(tmp_path / "file.h5", 2.0)
-        return row(file, sealed)
+        return row(file)
 
     assert (disk.read(tmp_path / "file.h5", MPI.COMM_SELF, take) == 1.0).all()
     assert (disk.read(tmp_path / "file.h5", MPI.COMM_SELF, row) == 2.0).all()
@@ -197,4 +195,4 @@ def test_a_file_with_a_link_to_another_is_refused(tmp_path):
             file["row"] = h5py.ExternalLink("other.h5", "row")
     comm.Barrier()
     with pytest.raises(FileError, match=r"file\.h5: .*row is a link"):
-        disk.read(tmp_path / "file.h5", comm, lambda file, sealed: None)
+        disk.read(tmp_path / "file.h5", comm, len, sealed=False)

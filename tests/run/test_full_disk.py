@@ -125,8 +125,7 @@ def test_rows_of_all_ranks_and_rows_that_have_no_room(tmp_path):
     comm.Barrier()
     assert [file.name for file in tmp_path.iterdir()] == ["rows.h5"]
 
-    def take(file, sealed):
-        assert sealed
+    def take(file):
         assert (file.attrs["format"], file["a"].attrs["dt"]) == (1, 0.5)
         return {name: file[name][()] for name in (*rows, *shared)}
 

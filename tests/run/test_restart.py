@@ -28,9 +28,9 @@ from program import (
     steps_of,
     summary_of,
 )
+from sealed import edited
 
 import pctt
-from dem.contact.polyhedra import hulls_of
 from dem.experiment import Experiment
 from dem.scene import Scene
 from dem.scenes import Mixer
@@ -39,7 +39,7 @@ from pctt.disk import FileError, Lock
 from pctt.folder import Folder
 from pctt.options import OptionError
 from pctt.run.settings import Settings
-from pctt.run.state import FIRST_FORMAT, origin, settled_path, unfinished
+from pctt.run.state import origin, settled_path, unfinished
 from pctt.simulation import Simulation
 
 
@@ -62,22 +62,18 @@ def test_on_as_many_ranks_the_way_is_the_same_bit_for_bit(solver, program, settl
     assert len(steps[0]) == len(steps[1]) == 3
 
 
-def test_a_checkpoint_of_before_has_the_impulses_of_its_contacts(tmp_path):
-    """It named a contact by one number of 64 bits."""
+def test_a_checkpoint_of_another_format_is_refused(tmp_path):
     sim = pctt.Simulation(Mixer(n=1), dt=0.02, solver="apgd", comm=MPI.COMM_SELF)
-    sim.run(steps=40)
-    sim.save(tmp_path / "new.h5")
-    key = sim.memory.state()[0]
-    numbers, features = 27 + 5 + 1, hulls_of(()).features  # spheres, walls and the paddle; a corner or edges of boxes
-    old = ((key.real * numbers + key.imag // features) * features + key.imag % features).astype(np.int64)
-    assert len(np.unique(old)) == len(key) > 10
-    shutil.copy(tmp_path / "new.h5", tmp_path / "old.h5")
-    with h5py.File(tmp_path / "old.h5", "r+") as file:
-        del file["contacts/key"]
-        file["contacts/key"] = old
-        file.attrs["format"] = FIRST_FORMAT  # without a checksum
-    again = pctt.Simulation.load(tmp_path / "old.h5", Mixer(n=1), dt=0.02, solver="apgd", comm=MPI.COMM_SELF)
-    np.testing.assert_array_equal(again.memory.state()[0], key)
+    sim.save(tmp_path / "old.h5")
+    with edited(tmp_path / "old.h5") as file:
+        file.attrs["format"] = "pctt checkpoint 3"
+    words = r"old\.h5: .*its format is 'pctt checkpoint 3'; allowed is 'pctt checkpoint 4'"
+    with pytest.raises(FileError, match=words):
+        pctt.Simulation.load(tmp_path / "old.h5", Mixer(n=1), dt=0.02, solver="apgd", comm=MPI.COMM_SELF)
+    with h5py.File(tmp_path / "old.h5", "a") as file:
+        file.attrs["format"] = "pctt checkpoint 4"
+    with pytest.raises(FileError, match="it has no checksum"):
+        pctt.Simulation.load(tmp_path / "old.h5", Mixer(n=1), dt=0.02, solver="apgd", comm=MPI.COMM_SELF)
 
 
 @pytest.mark.parallel(3)
@@ -247,17 +243,6 @@ def test_a_flipped_bit_is_an_error_on_all_ranks(name, flips, tmp_path, monkeypat
     read()
 
 
-def test_a_checkpoint_without_time_step_scene_file_and_checksums_is_taken(drop, tmp_path):
-    """As earlier versions wrote them."""
-    with h5py.File(tmp_path / "out" / "checkpoint.h5", "a") as file:
-        assert file.attrs["dt"] > 0
-        for name in ("dt", "scene_file", "surfaces"):
-            del file.attrs[name]
-        file.attrs["format"] = "pctt checkpoint 1"
-    drop(DROP + "# changed", dt="0.02")
-    assert step_of(tmp_path / "out" / "checkpoint.h5") == 4
-
-
 def test_figures_that_are_no_numbers_are_gone_on_with(drop, tmp_path):
     """Such a step is told by null in steps.jsonl, and its residual is the worst."""
     path = tmp_path / "out" / "steps.jsonl"
@@ -292,8 +277,7 @@ def test_a_state_that_no_run_can_have_is_refused(tmp_path, monkeypatch):
     for name, (value, words) in IMPOSSIBLE.items():
         if MPI.COMM_WORLD.rank == 0:
             shutil.copy("whole.h5", "edited.h5")
-            with h5py.File("edited.h5", "a") as file:
-                file.attrs["format"] = "pctt checkpoint 1"
+            with edited("edited.h5") as file:
                 assert file[name].size
                 file[name][() if file[name].ndim == 0 else slice(2)] = value
         MPI.COMM_WORLD.Barrier()
@@ -320,8 +304,7 @@ def test_columns_of_other_lengths_are_refused(tmp_path, monkeypatch):
         change = [rows[:-1], np.concatenate([rows, rows[-1:] + (name == "world/slabs")]), rows.ravel()[0]][turn % 3]
         if comm.rank == 0:
             shutil.copy("whole.h5", "edited.h5")
-            with h5py.File("edited.h5", "a") as file:
-                file.attrs["format"] = "pctt checkpoint 1"
+            with edited("edited.h5") as file:
                 del file[name]
                 file[name] = change
         comm.Barrier()

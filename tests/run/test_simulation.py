@@ -115,15 +115,15 @@ def test_a_servo_takes_another_speed():
     tool = sim.body("tool")
     np.testing.assert_allclose(tool.velocity[:3], [0.5, 0, 0], atol=1e-12)
     place = tool.position
-    tool.motion.speed = -0.25
+    sim.change("body tool", speed=-0.25)
     assert tool.motion.speed == -0.25
     sim.run(steps=20)
     np.testing.assert_allclose(tool.velocity[:3], [-0.25, 0, 0], atol=1e-12)
     assert abs(tool.position[0] - (place[0] - 0.25 * 0.2)) < 0.01  # after the time in which its force brakes it
     with pytest.raises(ValueError, match=r"cannot change its motion to Fixed.*Guided with another drive"):
-        tool.motion = Fixed()
+        sim.change("body tool", motion=Fixed())
     with pytest.raises(ValueError, match="cannot change its motion"):
-        tool.motion.direction = (0, 1, 0)
+        sim.change("body tool", direction=(0, 1, 0))
 
 
 @pytest.mark.parametrize(
@@ -141,8 +141,7 @@ def test_a_body_on_a_path_goes_on_from_where_it_is(motion, changes, velocity):
     sim.run(steps=13)
     tool = sim.body("tool")
     before = tool.position, tool.orientation
-    for name, value in changes.items():
-        setattr(tool.motion, name, value)
+    sim.change("body tool", **changes)
     np.testing.assert_array_equal(tool.position, before[0])
     sim.step()
     np.testing.assert_allclose(tool.position, before[0] + 0.01 * tool.velocity[:3], rtol=1e-12)
@@ -156,7 +155,7 @@ def test_an_oscillation_of_another_period_stays_in_its_phase():
     sim = moved(Oscillation((1, 0, 0), 0.1, 1.0))
     sim.run(steps=37)
     phase = 2 * np.pi * 0.37
-    sim.body("tool").motion.period = 0.5
+    sim.change("body tool", period=0.5)
     places = []
     sim.run(steps=50, call=lambda sim: places.append(sim.body("tool").position[0] - 1))
     expected = 0.1 * np.sin(phase + 2 * np.pi * 0.01 * np.arange(1, 51) / 0.5)
@@ -166,7 +165,7 @@ def test_an_oscillation_of_another_period_stays_in_its_phase():
 def test_a_body_on_a_path_takes_another_one():
     sim = moved(Fixed())
     sim.run(steps=5)
-    sim.body("tool").motion = Glide((0, 0, 1), start=0.1)
+    sim.change("body tool", motion=Glide((0, 0, 1), start=0.1))
     sim.run(until=0.3)
     np.testing.assert_allclose(sim.body("tool").position, [1, 2, 3.2], rtol=1e-12)
 
@@ -182,11 +181,11 @@ def test_a_path_that_would_let_the_body_jump_is_refused():
     sim = moved(Fixed())
     sim.step()
     with pytest.raises(ValueError, match="OnRails does not displace the pose at time zero: the body would jump"):
-        sim.body("tool").motion = OnRails()
+        sim.change("body tool", motion=OnRails())
     with pytest.raises(ValueError, match="cannot change its motion to Guided.*allowed is a path"):
-        sim.body("tool").motion = Guided((1, 0, 0))
+        sim.change("body tool", motion=Guided((1, 0, 0)))
     with pytest.raises(ValueError, match="Fixed has no speed"):
-        sim.body("tool").motion.speed = 1.0
+        sim.change("body tool", speed=1.0)
     with pytest.raises(ValueError, match="no large body 'paddle'; there are: tool"):
         sim.body("paddle")
 
@@ -217,7 +216,7 @@ def test_two_simulations_by_turns_do_not_disturb_each_other():
 
     for solver in ("apgd", "pdip"):
         one, two, alone = make(solver), make(solver), make(solver)
-        two.body("stirrer").motion.speed = -2.0
+        two.change("body stirrer", speed=-2.0)
         for _ in range(6):
             one.step()
             two.step()
@@ -312,8 +311,8 @@ def test_a_loaded_simulation_goes_on_with_the_same_bits(tmp_path):
     """Also with motions that were changed: of a servo, and of a body on a path."""
 
     def change(sim, k):
-        sim.body("stirrer").motion.speed = 2.0 + k
-        sim.body("lid").motion = Rotation((0, 0, 1 + k), (0.1, 0, 0))
+        sim.change("body stirrer", speed=2.0 + k)
+        sim.change("body lid", motion=Rotation((0, 0, 1 + k), (0.1, 0, 0)))
 
     @dataclass(frozen=True)
     class Lidded(Stirred):
@@ -464,7 +463,7 @@ def test_an_error_of_one_rank_is_one_of_all():
         sim.run(steps=2, stop=bad)
     with pytest.raises(OptionError, match="tol"):
         pctt.Simulation(Stirred(), tol=2.0 if WORLD.rank else 1e-3)
-    sim.body("stirrer").motion.speed = float(WORLD.rank)  # the first rank's counts
+    sim.change("body stirrer", speed=float(WORLD.rank))  # the first rank's counts
     assert sim.body("stirrer").motion.speed == 0.0
 
 

@@ -43,7 +43,7 @@ def packing(friction: float, seed: int, first: float | None = None, tol: float =
     scene.add_spheres(place, radius, DENSITY)
     sim = Simulation(scene, dt=0.003, solver="apgd", tol=tol, comm=MPI.COMM_SELF)
     sim.run(steps=400 if friction else 800)
-    sim.set_stress((PRESSURE / 10,) * 3)
+    sim.change("cell", stress=(PRESSURE / 10,) * 3)
     sim.run(steps=200)
     sample, period = sim.sample, sim.period
     on = bearing(sample)
