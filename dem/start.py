@@ -20,7 +20,6 @@ from dem.period import put_back, velocity_in_cell, wrapped
 from dem.polyhedra import Solid
 from dem.scene import Scene, least_half
 from dem.sources import Tally, from_array
-from dem.step import follow_motions
 from dem.world import Servo, Shear, World, refuse_load
 
 
@@ -36,7 +35,7 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     grains.velocity = velocity_in_cell(grains.position, grains.velocity, _shear(scene))
     grains.position = wrapped(grains.position, scene.period, _shear(scene))
     world = _world(scene, comm, grains)
-    follow_motions(world)
+    world.put_large(world.poses(0.0))
     put_back(world)
     redistribute(world)
     _refuse_overlap(world, overlap)

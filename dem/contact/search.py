@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dem import bodies
-from dem.applied import drives_of, free_directions, free_turns, grains_free_velocity
 from dem.arrays import Bools, Floats, Ints, Keys, places
 from dem.bodies import CAPSULE, CLUMP, MESH, SPHERE
 from dem.checks import not_negative
@@ -16,9 +15,11 @@ from dem.contact.ahead import Course
 from dem.contact.candidates import meeting
 from dem.contact.lists import grain_lists
 from dem.contact.primitives import extents, touches, touches_ahead
+from dem.drives import free_directions, free_turns
 from dem.neighbourhood import Neighbourhood, refreshed
 from dem.period import Images, refuse_short
 from dem.quaternion import cross, length
+from dem.unconstrained import UnconstrainedMotion
 from dem.world import World
 
 #: Margin of a grain over the way that it goes in a step without contact forces: those that push it on often add a part.
@@ -89,26 +90,26 @@ class Contacts:
 
 
 def find_contacts(
-    world: World, delta: float, dt: float = 0.0, margin: Floats | float = 0.0, shifts: Floats | None = None,
-    besides: Contacts | None = None,
+    world: World, delta: float, free: UnconstrainedMotion | None = None, margin: Floats | float = 0.0,
+    shifts: Floats | None = None, besides: Contacts | None = None,
 ) -> Contacts:  # fmt: skip
     """All contacts that this rank owns of the pairs whose margins meet; collective.
 
-    The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces, of a grain FURTHER
-    times that, if it is longer. So a gap of at most `delta` is a contact, and so is a wider one that may close within
-    the step, also when a third body stops one of the two. `margin` (grains,) [m] are the least margins of the local
-    grains, `shifts` (k, large, 6) [m, rad] further ways and turns of the large bodies that their margins are to cover.
-    A contact belongs to the rank that owns the body of lower global index. The numbers of contacts that the grains own
-    are left in `world.grains.weight`.
+    The margin of a body is delta/2 [m], or the way that it goes in a step of the motion `free` without contacts, of a
+    grain FURTHER times that, if it is longer; None: where bodies are, not where they will be. So a gap of at most
+    `delta` is a contact, and so is a wider one that may close within the step, also when a third body stops one of the
+    two. `margin` (grains,) [m] are the least margins of the local grains, `shifts` (k, large, 6) [m, rad] further ways
+    and turns of the large bodies that their margins are to cover. A contact belongs to the rank that owns the body of
+    lower global index. The numbers of contacts that the grains own are left in `world.grains.weight`.
 
     With `besides`, contacts that a search with margins not greater has found, only those are found that are not among
     them, and the weights stay.
     """
     not_negative("contact distance delta", delta)
+    dt, velocity = (0.0, world.grains.velocity) if free is None else (free.dt, free.grains)
     if shifts is None:
-        shifts = (dt * drives_of(world, dt).free if dt else np.zeros_like(world.large.velocity))[None]
-    free = grains_free_velocity(world, dt) if dt else world.grains.velocity
-    way = ways(world.grains.shape, world.grains.size, free, FURTHER * dt)
+        shifts = (np.zeros_like(world.large.velocity) if free is None else dt * free.drives.free)[None]
+    way = ways(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
     way = way + cell_way(world, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
     refuse_short(world, margin)
@@ -125,8 +126,8 @@ def find_contacts(
     table, i, j, reach = table.of_members(i, j, reach)
     moved: Floats | None = None
     linear: Floats | None = None
-    if dt:
-        course = Course(near.bodies.position, _motions(world, near, pictures, dt), dt)
+    if free is not None:
+        course = Course(near.bodies.position, _motions(world, near, pictures, free.prescribed), dt)
         (pair, feature, touch), moved, linear = touches_ahead(table, i, j, reach, course)
     else:
         pair, feature, touch = touches(table, i, j, reach)
@@ -157,11 +158,11 @@ def find_contacts(
     return replace(contacts.take(~rigid), held_overlap=-float(contacts.gap[rigid].min(initial=0.0)))
 
 
-def _motions(world: World, near: Neighbourhood, pictures: Images | None, dt: float) -> Floats:
-    """Velocities (rows, 6) before the step of dt [s] of the bodies of a neighbourhood, of prescribed ones those of the
-    step; images and centres have those that a cell gives them."""
+def _motions(world: World, near: Neighbourhood, pictures: Images | None, prescribed: Floats) -> Floats:
+    """Velocities (rows, 6) before the step of the bodies of a neighbourhood, of prescribed ones those of the step;
+    images and centres have those that a cell gives them."""
     velocity, seen = near.bodies.velocity.copy(), near.grains + near.ghosts
-    velocity[seen:] = world.prescribed_velocity(dt)
+    velocity[seen:] = prescribed
     if world.shear is not None and pictures is not None:
         velocity[:seen, 0] += world.shear.speed * pictures.boundaries(np.arange(seen))
     if world.servo is not None:

@@ -26,6 +26,7 @@ from dem.contact_map.halo import Halo, Messages
 from dem.morton import morton_codes
 from dem.partition import frame_of_most, redistribute, splitters
 from dem.scenes import Mixer
+from dem.unconstrained import unconstrained
 from dem.world import World
 from pctt import ccp
 from pctt.ccp.newton.fronts import Fronts
@@ -101,9 +102,9 @@ def counted(n: int, times: list[int]) -> list[Row]:
     rows: list[Row] = []
     for world in (sim.world, copies(sim.world, times)):
         redistribute(world)
-        find_contacts(world, sim.settings.delta, sim.settings.dt)
+        find_contacts(world, sim.settings.delta, unconstrained(world, sim.settings.dt))
         redistribute(world)
-        contacts = find_contacts(world, sim.settings.delta, sim.settings.dt)
+        contacts = find_contacts(world, sim.settings.delta, unconstrained(world, sim.settings.dt))
         body = moving(world, contacts)
         for ranks in (2**k for k in range(1, 11) if 2**k * FEW <= len(world.grains)):
             found = pieces(world, body, ranks)
