@@ -8,7 +8,7 @@ The loop of a simulation, on any number of ranks::
         contacts = find_contacts(world, delta, free)
         system = ContactSystem(world, contacts, free, recovery_speed)
         impulse = ...  # (nc, 3) of the contacts, by a solver of yours or by `pctt.ccp.solve`
-        advance(world, free, system.velocity(impulse))
+        advance(world, free, contacts, system.velocity(impulse))
         rebalance(world)
 
 Import from the modules: `dem.scene`, `dem.shapes`, `dem.motion` describe what there is; `dem.start`, `dem.world`,

@@ -46,10 +46,10 @@ def refuse_passages(
     speed = length(velocity[: len(grains), :3])
     way = dt * speed
     fast = (way > most) & np.isfinite(way)
-    weight, reach, seen = grains.weight, 1.0, contacts.near.margin[: len(grains)]
+    lists, reach, seen = contacts.lists, 1.0, contacts.near.margin[: len(grains)]
     large = large_velocity(world, free, velocity)
-    known = find_contacts(world, delta, None, seen, contacts.shifts).key  # where bodies are, not where they will be
-    grains.weight = weight
+    # where bodies are, not where they will be
+    known = find_contacts(world, delta, None, seen, contacts.shifts, lists).key
     while reach < furthest:
         reach *= 2.0
         worst = (0.0, -1, -1)  # speed [m/s], and the ids of the grain and of what it meets
@@ -58,10 +58,9 @@ def refuse_passages(
             worst = (float(speed[row]), int(grains.id[row]), -1) if row >= 0 else worst
         else:
             margin = np.where(fast, np.minimum(way, reach * most), 0.0)
-            wide = find_contacts(world, delta, None, np.maximum(seen, margin), contacts.shifts)
-            grains.weight = weight
-            wide = wide.take(places(known, wide.key) < 0)
-            table = velocities_about(world, wide.near, velocity, large)
+            wide = find_contacts(world, delta, None, np.maximum(seen, margin), contacts.shifts, lists)
+            lists, wide = wide.lists, wide.take(places(known, wide.key) < 0)
+            table = velocities_about(wide, velocity, large)
             met = wide.take(_meet(world, wide, table, delta, dt))
             if len(met):
                 pair = np.stack([met.a, met.b], axis=1)

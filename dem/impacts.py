@@ -73,7 +73,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         return contacts
     rows = np.stack([contacts.a, contacts.b], axis=1)
     chosen = np.flatnonzero(_reached(world, contacts, rows[kind == PAIR], marked)[rows].any(axis=1))
-    free = velocities_about(world, near, motion.grains, old[grains:])
+    free = velocities_about(contacts, motion.grains, old[grains:])
     forced = free[:, :3] - old[:, :3]
     columns = (table.position, free, forced, radius[:, None], table.mass[:, None], table.inertia[:, :1])
     body, of = np.concatenate(columns, axis=1), rows[chosen]
@@ -130,7 +130,7 @@ def _with_impacts(
 def _reached(world: World, contacts: Contacts, pairs: Ints, marked: Bools) -> Bools:
     """The bodies (rows,) that impacts of the marked ones may reach: through open contacts of spheres, the rows `pairs`
     (m, 2), that touch no other grain; collective."""
-    halo, flags = world.lists.halo, np.zeros((len(marked), 2))
+    halo, flags = contacts.lists.halo, np.zeros((len(marked), 2))
     beside = (contacts.gap <= 0.0) & (contacts.b < contacts.near.grains + contacts.near.ghosts)
     flags[:, 0] = marked
     flags[contacts.a[beside], 1] = flags[contacts.b[beside], 1] = 1.0

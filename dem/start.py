@@ -188,7 +188,6 @@ def _refuse_overlap(world: World, overlap: float) -> None:
 
     Large bodies that a joint joins may share a place, and so may those that no force can part (`held_overlap`)."""
     contacts = find_contacts(world, 0.0)
-    world.grains.weight[:] = 0.0
     table = contacts.near.bodies
     worst = (0.0, 0.0, -1, -1)
     if len(contacts):

@@ -134,13 +134,14 @@ class Step:
 
 
 def advance(
-    world: World, free: UnconstrainedMotion, velocity: Floats, lag: Floats | None = None, kept: Floats | None = None
+    world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats, kept: Floats | None = None
 ) -> None:
-    """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by the step of the motion `free`; `kept`
-    (owned, 6) are those with which they go into the next step, if they are others. Collective.
+    """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by the step of the motion `free` with these
+    contacts; `kept` (owned, 6) are those with which they go into the next step, if they are others. Collective.
 
     x <- x + dt (v + E x) + lag, q <- exp(dt w) q, with the rate E of a cell that changes its size, and the lag
-    (grains, 3) of `Contacts` [m].
+    (grains, 3) of `Contacts` [m]. The next search begins with the lists of this one, and the balancer goes by the
+    contacts that grains own.
     Prescribed motions are followed exactly, whatever dt.
     """
     dt, start, of_large = free.dt, world.grains.position, large_velocity(world, free, velocity)
@@ -149,8 +150,9 @@ def advance(
     _move(world.large, of_large, dt)
     if kept is not None and large_kept is not None:
         world.grains.velocity, world.large.velocity = kept[: len(world.grains)].copy(), large_kept
-    if lag is not None:
-        world.grains.position = world.grains.position + lag
+    if contacts.lag is not None:
+        world.grains.position = world.grains.position + contacts.lag
+    world.lists, world.grains.weight = contacts.lists, contacts.owned
     if world.servo is not None:
         world.grains.position = world.grains.position + dt * world.servo.rate * start
     if free.applied is not None:
@@ -163,11 +165,11 @@ def advance(
     world.put_large(free.poses)
 
 
-def advanced(world: World, free: UnconstrainedMotion, velocity: Floats, lag: Floats | None = None) -> World:
+def advanced(world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats) -> World:
     """The world that `advance` leads to; this one stays as it is. Collective."""
     after = copy(world)
     after.grains, after.large = replace(world.grains), replace(world.large)
-    advance(after, free, velocity, lag)
+    advance(after, free, contacts, velocity)
     return after
 
 
@@ -198,13 +200,13 @@ def find_overrun(
         return None
     shifts = np.concatenate([contacts.shifts, dt * large[None]]) if beyond else contacts.shifts
     margin = np.maximum(seen, way)
-    unseen = find_contacts(world, delta, free, margin, shifts, besides=contacts)
-    table = velocities_about(world, unseen.near, velocity, large)
+    unseen = find_contacts(world, delta, free, margin, shifts, contacts.lists, besides=contacts)
+    table = velocities_about(unseen, velocity, large)
     opening = _opening(world, unseen, unseen.near.bodies.position, table)
     overlap = -dt * (gap_velocities(world, unseen, dt, recovery_speed)[2] + opening)
     if not on_any(world.comm, bool((overlap > depth).any()))[0]:
         return None
-    return find_contacts(world, delta, free, margin, shifts)
+    return find_contacts(world, delta, free, margin, shifts, unseen.lists)
 
 
 def _opening(world: World, contacts: Contacts, position: Floats, velocity: Floats) -> Floats:
@@ -233,7 +235,7 @@ def find_turned(
     dt = free.dt
     if not _turn(world, velocity[: len(world.grains)], dt, depth):
         return None
-    end = find_contacts(advanced(world, free, velocity, contacts.lag), 0.0)
+    end = find_contacts(advanced(world, free, contacts, velocity), 0.0)
     end = end.take(end.gap < -depth)
     start, approach = _at_start(world, end, dt)
     overlap = -(dt * gap_velocities(world, start, dt, recovery_speed)[2] + approach)

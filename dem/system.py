@@ -53,6 +53,7 @@ class ContactSystem:
     Attributes, of nc local contacts and of the bodies whose rows this rank owns (`World.owned`):
         dt (float): step [s]
         motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`
+        contacts: as the search found them
         key (nc,), mu (nc,), point (nc, 3): contact key, friction coefficient, contact point [m]
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
@@ -95,7 +96,7 @@ class ContactSystem:
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
         near, owned = contacts.near, world.owned
-        self.dt, self.motion, self.near = dt, motion, near
+        self.dt, self.motion, self.contacts, self.near = dt, motion, contacts, near
         self.key, self.mu, self.point = contacts.key, contacts.friction, contacts.point
         self.frame = contact_frames(contacts.normal)
         moves = bodies.is_dynamic(near.bodies)

@@ -494,7 +494,7 @@ for _ in range(3):
     memory.remember(contacts.key, result.impulse, system.frame)
     step = Step(world, contacts, system, result.impulse)
     print(len(contacts.gap), "contacts, the floor bears", round(-step.force_on("floor")[2], 3), "N")
-    advance(world, free, system.velocity(result.impulse))
+    advance(world, free, contacts, system.velocity(result.impulse))
 
 # %% dem.contact_map.ContactMap, dem.contact_map.CompactRows, dem.contact_map.Halo, dem.neighbourhood.Neighbourhood
 import numpy as np

@@ -125,7 +125,7 @@ class Stepper:
             self.system.take_flow(self.world, self.contacts)
             velocity = self.system.velocity_with(result.momentum)
             kept = self.system.kept(self.world, velocity) if self.system.middle is not None else None
-            advance(self.world, self.motion, velocity, self.contacts.lag, kept)
+            advance(self.world, self.motion, self.contacts, velocity, kept)
             kept = self.system.held_after(result.impulse)  # with which springs begin the next step
             self.memory.remember(self.system.key, kept, self.system.frame)
             self._slabs = self.world.slabs

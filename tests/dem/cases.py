@@ -100,7 +100,7 @@ def crude_impulse(system: ContactSystem) -> Floats:
 def step(world: World, dt: float = 0.005, delta: float = 0.02) -> Contacts:
     contacts = find_contacts(world, delta)
     system = ContactSystem(world, contacts, unconstrained(world, dt), recovery_speed=0.5)
-    advance(world, system.motion, system.velocity(crude_impulse(system)))
+    advance(world, system.motion, system.contacts, system.velocity(crude_impulse(system)))
     return contacts
 
 

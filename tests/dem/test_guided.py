@@ -48,7 +48,7 @@ def test_only_the_motion_along_the_guide_answers_to_forces(direction):
     velocity = system.velocity(impulse)[5]
     np.testing.assert_allclose(velocity, [*(speed * unit), 0, 0, 0], atol=1e-13)
     turn = world.large.quaternion[1].copy()
-    advance(world, system.motion, system.velocity(impulse))
+    advance(world, system.motion, system.contacts, system.velocity(impulse))
     np.testing.assert_array_equal(world.large.quaternion[1], turn)
     np.testing.assert_allclose(world.large.position[1], [0.1, 0.1, 0.25] + 0.01 * speed * unit, atol=1e-14)
 

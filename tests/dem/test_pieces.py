@@ -16,7 +16,7 @@ from dem.unconstrained import unconstrained
 
 def searched(comm):
     world = new_world(heap(3), comm)
-    find_contacts(world, 0.05)
+    world.grains.weight = find_contacts(world, 0.05).owned
     redistribute(world)
     return world, find_contacts(world, 0.05)
 

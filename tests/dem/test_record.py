@@ -33,7 +33,7 @@ def made(world, solve=crude_impulse, dt=DT, delta=0.02):
     contacts = find_contacts(world, delta)
     system = ContactSystem(world, contacts, unconstrained(world, dt), recovery_speed=0.5)
     impulse = solve(system)
-    advance(world, system.motion, system.velocity(impulse))
+    advance(world, system.motion, system.contacts, system.velocity(impulse))
     return record.Step(world, contacts, system, impulse)
 
 

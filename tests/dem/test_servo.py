@@ -38,7 +38,7 @@ def step(world, tol=1e-9, dt=DT):
     system = ContactSystem(world, find_contacts(world, 0.01, free), free)
     with cone_problem(system, SELF) as problem:
         impulse = ccp.solve(problem, None, "apgd", ccp.Limits(tol), law=ccp.COULOMB).impulse
-    advance(world, system.motion, system.velocity(impulse))
+    advance(world, system.motion, system.contacts, system.velocity(impulse))
     return force_on(world, system, "tool", impulse)
 
 

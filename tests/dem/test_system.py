@@ -66,7 +66,7 @@ def test_relative_velocity_is_the_rate_of_gaps_and_points(contacts):
         quaternion.rotate(quaternion.conjugate(before.quaternion[row]), contacts.point - before.position[row])
         for row in (contacts.a, contacts.b)
     ]
-    advance(world, unconstrained(world, eps), velocity)
+    advance(world, unconstrained(world, eps), contacts, velocity)
     after = find_contacts(world, 0.03)
     place = {key: i for i, key in enumerate(after.key)}
     same = np.array([place[key] for key in contacts.key])

@@ -96,7 +96,7 @@ def test_errors_reach_all_ranks_and_one_body_is_enough():
             impulse[:, 0] = world.grains.mass[0] * 9.81 * 0.01 if len(world.grains) else 0.0
             assert dense_map(system).shape == (3 * len(contacts), 12)
             force = force_on(world, system, "floor", impulse)
-            advance(world, system.motion, system.velocity(impulse))
+            advance(world, system.motion, system.contacts, system.velocity(impulse))
             rebalance(world)
         assert comm.allreduce(len(contacts)) == (height < 1)
         if height < 1:

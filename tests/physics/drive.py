@@ -74,7 +74,7 @@ def steps(
         problem.destroy()
         reached = f"{result.reason}, residual {result.residual:.1e}"
         assert result.converged or iterations, f"step {world.step + 1}: {reached}"
-        advance(world, free, system.velocity(result.impulse))
+        advance(world, free, contacts, system.velocity(result.impulse))
         yield Step(world, contacts, system, result.impulse)
 
 

@@ -79,7 +79,7 @@ def test_where_velocities_stay_the_end_is_met(grains, floor, cell, kinds):
     velocity = np.concatenate([world.grains.velocity, free.prescribed])
     start = find_contacts(world, 0.0, None, contacts.near.margin[: len(world.grains)], contacts.shifts)
     assert {tuple(pair) for pair in start.body} <= {tuple(pair) for pair in contacts.body}
-    end = find_contacts(advanced(world, free, velocity), 0.08)
+    end = find_contacts(advanced(world, free, contacts, velocity), 0.08)
     near = contacts.near.bodies.velocity.copy()
     near[len(world.grains) :] = velocity[len(world.grains) :]
     opening = ContactSystem(world, contacts, free).contact_map.relative_velocities(near)[:, 0]

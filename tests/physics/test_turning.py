@@ -75,7 +75,7 @@ def test_bodies_that_keep_apart_are_left_alone():
 def test_the_gap_at_the_start_leads_to_that_of_the_end():
     """With velocities that send grains into each other: gap + dt times normal velocity is the gap of the end."""
     world, contacts, velocity, found = found_of(MPI.COMM_SELF)
-    end = find_contacts(advanced(world, unconstrained(world, DT), velocity), 0.0)
+    end = find_contacts(advanced(world, unconstrained(world, DT), contacts, velocity), 0.0)
     new = found.take(np.isin(found.key, end.key) & ~np.isin(found.key, contacts.key))
     assert len(new) > 0
     assert set(contacts.key) <= set(found.key)

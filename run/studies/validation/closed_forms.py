@@ -39,7 +39,7 @@ def moved(scene: Scene, seconds: float, until: Callable[[World], bool] = lambda 
     world = new_world(scene, MPI.COMM_SELF)
     while world.time < seconds - 1e-9 and not until(world):
         system, impulse = solved(world)
-        advance(world, system.motion, system.velocity(impulse))
+        advance(world, system.motion, system.contacts, system.velocity(impulse))
     return world
 
 
