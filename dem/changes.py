@@ -70,7 +70,6 @@ def _put(world: World, kind: str, name: str, part: Named) -> None:
         refuse_load(world, name, part)
     getattr(world, PARTS[kind])[name] = part
     world.changed.add((kind, name))
-    world.act_anew()
 
 
 def refuse_load(world: World, name: str, load: Load) -> None:

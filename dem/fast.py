@@ -19,14 +19,17 @@ from dem.exchange import on_any, reduced
 from dem.quaternion import cross, length
 from dem.system import contact_arms
 from dem.together import SceneError
+from dem.unconstrained import UnconstrainedMotion, large_velocity
 from dem.world import World
 
 FAR = 2.0  #: radii that a margin reaches at most
 MANY = 1e7  #: pairs that are tested at most when margins are wider than a packing
 
 
-def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float) -> None:
-    """SceneError, on all ranks, if with these velocities (owned, 6) a grain goes further in dt [s] than two radii, and
+def refuse_passages(
+    world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats, delta: float
+) -> None:
+    """SceneError, on all ranks, if with these velocities (owned, 6) a grain goes further in a step than two radii, and
     may meet a body that is in no contact with it; collective.
 
     For two spheres the test is exact. For other pairs it asks whether the grain crosses the plane through the closest
@@ -34,7 +37,7 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
     some that pass beside a body. The margins are doubled from one search to the next, so that in a dense packing the
     first search tells.
     """
-    grains = world.grains
+    grains, dt = world.grains, free.dt
     most = FAR * bodies.bounding_radius(grains)
     here, own = beyond(velocity, most, dt)
     if not on_any(world.comm, here > 0)[0]:
@@ -43,10 +46,10 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
     speed = length(velocity[: len(grains), :3])
     way = dt * speed
     fast = (way > most) & np.isfinite(way)
-    weight, reach, seen = grains.weight, 1.0, contacts.near.margin[: len(grains)]
-    large = world.large_velocity(velocity, dt)
-    known = find_contacts(world, delta, 0.0, seen, contacts.shifts).key  # where bodies are, not where they will be
-    grains.weight = weight
+    lists, reach, seen = contacts.lists, 1.0, contacts.near.margin[: len(grains)]
+    large = large_velocity(world, free, velocity)
+    # where bodies are, not where they will be
+    known = find_contacts(world, delta, None, seen, contacts.shifts, lists).key
     while reach < furthest:
         reach *= 2.0
         worst = (0.0, -1, -1)  # speed [m/s], and the ids of the grain and of what it meets
@@ -55,10 +58,9 @@ def refuse_passages(world: World, contacts: Contacts, velocity: Floats, delta: f
             worst = (float(speed[row]), int(grains.id[row]), -1) if row >= 0 else worst
         else:
             margin = np.where(fast, np.minimum(way, reach * most), 0.0)
-            wide = find_contacts(world, delta, 0.0, np.maximum(seen, margin), contacts.shifts)
-            grains.weight = weight
-            wide = wide.take(places(known, wide.key) < 0)
-            table = velocities_about(world, wide.near, velocity, large)
+            wide = find_contacts(world, delta, None, np.maximum(seen, margin), contacts.shifts, lists)
+            lists, wide = wide.lists, wide.take(places(known, wide.key) < 0)
+            table = velocities_about(wide, velocity, large)
             met = wide.take(_meet(world, wide, table, delta, dt))
             if len(met):
                 pair = np.stack([met.a, met.b], axis=1)

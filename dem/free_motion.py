@@ -40,6 +40,18 @@ def fallen(table: Bodies, gravity: Floats, dt: float) -> tuple[Floats, int]:
     return falling(table.velocity, table.mass, table.shape, change)
 
 
+def velocity_changes(table: Bodies, impulse: Floats) -> Floats:
+    """What impulses and angular impulses (n, 6) change of the velocities (n, 6) of bodies on which nothing else acts;
+    zero where a mass or moment is infinite."""
+    change = np.empty_like(impulse)
+    change[:, :3] = impulse[:, :3] / table.mass[:, None]
+    change[:, 3:] = impulse[:, 3:] / table.inertia  # of spheres
+    rows = np.flatnonzero(impulse[:, 3:].any(axis=1) & (table.shape != bodies.SPHERE))
+    root = bodies.inverse_root_inertia(table.take(rows))
+    change[rows, 3:] = (root @ (root @ impulse[rows, 3:, None]))[:, :, 0]
+    return change
+
+
 def gyroscopic(table: Bodies) -> Ints:
     """The rows of bodies that turn freely and whose three moments are not equal."""
     rows = np.flatnonzero(bodies.is_dynamic(table) & (table.shape != SPHERE))

@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from dem.applied import grains_free_velocity, jointed
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import SPHERE
 from dem.compiled import inlined, loop
 from dem.contact import Contacts, velocities_about
 from dem.exchange import on_any
+from dem.unconstrained import UnconstrainedMotion, jointed
 from dem.vectors import cross, dot, plus
 from dem.world import World
 
@@ -44,8 +44,9 @@ ROUNDING = 1e-9
 SHORT = 25.0
 
 
-def in_order(world: World, contacts: Contacts, dt: float) -> Contacts:
-    """The contacts of a step of dt [s] with what impacts that are followed change of them; collective.
+def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> Contacts:
+    """The contacts of a step, of this motion without contacts, with what impacts that are followed change of them;
+    collective.
 
     Followed are impacts of two spheres, and of spheres that bounce from bodies that forces do not move, if they come
     faster than a fall of one step; without restitution those of two that are near no other. Two spheres that pass each
@@ -53,7 +54,7 @@ def in_order(world: World, contacts: Contacts, dt: float) -> Contacts:
     followed."""
     if world.shear is not None or world.servo is not None or world.pairs.cohesion.any():
         return contacts
-    near, table, pairs = contacts.near, contacts.near.bodies, world.pairs
+    near, table, pairs, dt = contacts.near, contacts.near.bodies, world.pairs, motion.dt
     grains, old = near.grains + near.ghosts, table.velocity
     ball = table.shape == SPHERE
     ball[grains:] = False
@@ -61,7 +62,7 @@ def in_order(world: World, contacts: Contacts, dt: float) -> Contacts:
         ball &= ~np.isin(table.id, jointed(world)[0])
     if pairs.restitution.any():
         old = old.copy()
-        old[grains:] = world.prescribed_velocity(dt)
+        old[grains:] = motion.prescribed
     period = np.full(3, np.inf) if world.period is None else world.period
     slow, radius = dt * math.hypot(*world.gravity), np.ascontiguousarray(table.size[:, 0])
     kind, bounce, offset, marked = struck(
@@ -72,7 +73,7 @@ def in_order(world: World, contacts: Contacts, dt: float) -> Contacts:
         return contacts
     rows = np.stack([contacts.a, contacts.b], axis=1)
     chosen = np.flatnonzero(_reached(world, contacts, rows[kind == PAIR], marked)[rows].any(axis=1))
-    free = velocities_about(world, near, grains_free_velocity(world, dt), old[grains:])
+    free = velocities_about(contacts, motion.grains, old[grains:])
     forced = free[:, :3] - old[:, :3]
     columns = (table.position, free, forced, radius[:, None], table.mass[:, None], table.inertia[:, :1])
     body, of = np.concatenate(columns, axis=1), rows[chosen]
@@ -129,7 +130,7 @@ def _with_impacts(
 def _reached(world: World, contacts: Contacts, pairs: Ints, marked: Bools) -> Bools:
     """The bodies (rows,) that impacts of the marked ones may reach: through open contacts of spheres, the rows `pairs`
     (m, 2), that touch no other grain; collective."""
-    halo, flags = world.lists.halo, np.zeros((len(marked), 2))
+    halo, flags = contacts.lists.halo, np.zeros((len(marked), 2))
     beside = (contacts.gap <= 0.0) & (contacts.b < contacts.near.grains + contacts.near.ghosts)
     flags[:, 0] = marked
     flags[contacts.a[beside], 1] = flags[contacts.b[beside], 1] = 1.0

@@ -114,12 +114,15 @@ class Geometry:
     axes: Floats  #: (n, 3, 3) rows x, y, z in the world
 
 
-def geometry(joints: Sequence[Joint], row: Ints, ends: Ends, period: Floats | None = None) -> Geometry:
-    """Of joints between bodies in the rows `row` (n, 2). With a `period` (3,) of the cell [m] the second ends are those
-    images whose anchors are nearest to the first ones."""
+def geometry(
+    joints: Sequence[Joint], row: Ints, position: Floats, orientation: Floats, period: Floats | None = None
+) -> Geometry:
+    """Of joints between bodies in the rows `row` (n, 2), with positions (bodies, 3) [m] and quaternions (bodies, 4).
+    With a `period` (3,) of the cell [m] the second ends are those images whose anchors are nearest to the first
+    ones."""
     anchors, frames = (np.array([getattr(joint, name) for joint in joints]) for name in ("anchors", "frames"))
-    turn = [quaternion.normalized(quaternion.multiply(ends.quaternion[row[:, k]], frames[:, k])) for k in (0, 1)]
-    places = [ends.position[row[:, k]] + quaternion.rotate(ends.quaternion[row[:, k]], anchors[:, k]) for k in (0, 1)]
+    turn = [quaternion.normalized(quaternion.multiply(orientation[row[:, k]], frames[:, k])) for k in (0, 1)]
+    places = [position[row[:, k]] + quaternion.rotate(orientation[row[:, k]], anchors[:, k]) for k in (0, 1)]
     axes = np.stack([quaternion.rotate(turn[0], unit) for unit in np.eye(3)], axis=1)
     relative = quaternion.multiply(quaternion.conjugate(turn[0]), turn[1])
     relative = np.where(relative[:, :1] < 0.0, -relative, relative)
@@ -136,7 +139,7 @@ def geometry(joints: Sequence[Joint], row: Ints, ends: Ends, period: Floats | No
     error = np.concatenate([np.einsum("nij,nj->ni", axes, d), turned], axis=1)
     out = np.zeros((len(joints), 6, 2, 6))
     for k, sign in ((0, -1.0), (1, 1.0)):
-        arm = places[1] - (1 - k) * image - ends.position[row[:, k]]
+        arm = places[1] - (1 - k) * image - position[row[:, k]]
         out[:, :3, k, :3] = sign * axes
         out[:, :3, k, 3:] = sign * np.cross(arm[:, None], axes)
         out[:, 3:, k, 3:] = sign * axes
@@ -188,7 +191,7 @@ def coupling(
     momentum of bodies that are no spheres, and the errors of joints at the end of the step. So joints hold there, as
     in the method SHAKE, with forces of the start of the step, and energy does not drift (Hairer, Lubich, Wanner,
     "Geometric Numerical Integration", section VII.1.4)."""
-    found = geometry(joints, row, ends, period)
+    found = geometry(joints, row, ends.position, ends.quaternion, period)
     count = len(ends.free)
     chosen: list[tuple[int, int]] = []
     target, most, kinds = [], [], []
@@ -250,7 +253,7 @@ def coupling(
         if dt * np.abs(after[:, 3:]).max(initial=0.0) > FAR:
             break
         place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after[:, 3:], dt)
-        error = geometry(joints, row, dataclasses.replace(ends, position=place, quaternion=turn), period).error
+        error = geometry(joints, row, place, turn, period).error
         bent = (error - found.error)[which, ways] / dt - J.reshape(len(t), -1) @ after.ravel()
         t = np.where(held, left - bent, left)
     fixed = (J, B, root, which, ways, kind, t, bound, free, slip, found.axes)

@@ -104,7 +104,6 @@ def put_back(world: World) -> None:
         world.grains.velocity = velocity_in_cell(position, world.grains.velocity, world.shear)
         world.grains.position = wrapped(position, period, world.shear)
         world.lists = None
-        world.act_anew()
 
 
 def refuse_across(world: World) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
-from dem.applied import slots
 from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
@@ -24,6 +23,7 @@ from dem.period import wrapped
 from dem.servo import cell_stress
 from dem.step import Step
 from dem.together import SceneError, digest, together
+from dem.unconstrained import slots
 from dem.world import World
 
 

@@ -21,7 +21,6 @@ from dem.period import put_back, velocity_in_cell, wrapped
 from dem.polyhedra import Solid
 from dem.scene import Scene, least_half
 from dem.sources import Tally, from_array
-from dem.step import follow_motions
 from dem.world import Servo, Shear, World
 
 
@@ -37,7 +36,7 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     grains.velocity = velocity_in_cell(grains.position, grains.velocity, _shear(scene))
     grains.position = wrapped(grains.position, scene.period, _shear(scene))
     world = _world(scene, comm, grains)
-    follow_motions(world)
+    world.put_large(world.poses(0.0))
     put_back(world)
     redistribute(world)
     _refuse_overlap(world, overlap)
@@ -190,7 +189,6 @@ def _refuse_overlap(world: World, overlap: float) -> None:
 
     Large bodies that a joint joins may share a place, and so may those that no force can part (`held_overlap`)."""
     contacts = find_contacts(world, 0.0)
-    world.grains.weight[:] = 0.0
     table = contacts.near.bodies
     worst = (0.0, 0.0, -1, -1)
     if len(contacts):

@@ -13,7 +13,6 @@ from functools import cached_property
 import numpy as np
 
 from dem import bodies, quaternion
-from dem.applied import applied_impulses
 from dem.arrays import ArrayLike, Bools, Floats, Ints, places
 from dem.bodies import SPHERE, Bodies
 from dem.cohesion import along_normal
@@ -24,6 +23,7 @@ from dem.measures import Sample
 from dem.period import before, lattice, resize, velocity_in_cell, wrapped
 from dem.system import ContactSystem, contact_arms, contact_frames, gap_velocities
 from dem.together import meet
+from dem.unconstrained import UnconstrainedMotion, large_velocity
 from dem.world import World
 
 ALIKE = 0.99  #: cosine between the normals of two linearisations of a contact of which the later one replaces the other
@@ -134,48 +134,43 @@ class Step:
 
 
 def advance(
-    world: World, velocity: Floats, dt: float, lag: Floats | None = None, kept: Floats | None = None
+    world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats, kept: Floats | None = None
 ) -> None:
-    """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by dt [s]; `kept` (owned, 6) are those with
-    which they go into the next step, if they are others. Collective.
+    """Take the velocities (owned, 6) of `ContactSystem` and move all bodies by the step of the motion `free` with these
+    contacts; `kept` (owned, 6) are those with which they go into the next step, if they are others. Collective.
 
     x <- x + dt (v + E x) + lag, q <- exp(dt w) q, with the rate E of a cell that changes its size, and the lag
-    (grains, 3) of `Contacts` [m].
-    Prescribed motions are followed exactly, whatever dt; SceneError if one fails.
+    (grains, 3) of `Contacts` [m]. The next search begins with the lists of this one, and the balancer goes by the
+    contacts that grains own.
+    Prescribed motions are followed exactly, whatever dt.
     """
-    large_velocity, start = world.large_velocity(velocity, dt), world.grains.position
-    large_kept = None if kept is None else world.large_velocity(kept, dt)
+    dt, start, of_large = free.dt, world.grains.position, large_velocity(world, free, velocity)
+    large_kept = None if kept is None else large_velocity(world, free, kept)
     _move(world.grains, velocity[: len(world.grains)], dt)
-    _move(world.large, large_velocity, dt)
+    _move(world.large, of_large, dt)
     if kept is not None and large_kept is not None:
         world.grains.velocity, world.large.velocity = kept[: len(world.grains)].copy(), large_kept
-    if lag is not None:
-        world.grains.position = world.grains.position + lag
+    if contacts.lag is not None:
+        world.grains.position = world.grains.position + contacts.lag
+    world.lists, world.grains.weight = contacts.lists, contacts.owned
     if world.servo is not None:
         world.grains.position = world.grains.position + dt * world.servo.rate * start
-    if world.springs:
-        world.expected = applied_impulses(world, dt).expected
+    if free.applied is not None:
+        world.expected = free.applied.expected
     if world.shear is not None:
         world.shear = world.shear.after(dt)
     resize(world, dt)
     world.time += dt
     world.step += 1
-    follow_motions(world)
+    world.put_large(free.poses)
 
 
-def advanced(world: World, velocity: Floats, dt: float, lag: Floats | None = None) -> World:
+def advanced(world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats) -> World:
     """The world that `advance` leads to; this one stays as it is. Collective."""
     after = copy(world)
     after.grains, after.large = replace(world.grains), replace(world.large)
-    advance(after, velocity, dt, lag)
+    advance(after, free, contacts, velocity)
     return after
-
-
-def follow_motions(world: World) -> None:
-    """Put the bodies of prescribed motion where they are to be now; collective. SceneError if a motion fails."""
-
-    for row, pose in world.poses(world.time).items():
-        world.large.position[row], world.large.quaternion[row] = pose
 
 
 def _move(table: Bodies, velocity: Floats, dt: float) -> None:
@@ -185,18 +180,19 @@ def _move(table: Bodies, velocity: Floats, dt: float) -> None:
 
 
 def find_overrun(
-    world: World, contacts: Contacts, velocity: Floats, delta: float, dt: float, depth: float, recovery_speed: float
-) -> Contacts | None:
-    """The contacts of wider margins, if with these velocities (owned, 6) bodies go further in dt [s] than their margins
-    in the search for `contacts`, and overlap by more than `depth` [m] with others that it has not seen. None if none
-    do; collective.
+    world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats, delta: float, depth: float,
+    recovery_speed: float,
+) -> Contacts | None:  # fmt: skip
+    """The contacts of wider margins, if with these velocities (owned, 6) bodies go further in the step than their
+    margins in the search for `contacts`, and overlap by more than `depth` [m] with others that it has not seen. None if
+    none do; collective.
 
     The search may be repeated for the contacts that it finds: margins only grow.
     """
-    seen = contacts.near.margin[: contacts.near.grains]
+    dt, seen = free.dt, contacts.near.margin[: contacts.near.grains]
     way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
     way = way + cell_way(world, dt)
-    large = world.large_velocity(velocity, dt)
+    large = large_velocity(world, free, velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
     gone = bool((way > seen).any()), goes_beyond(world, dt * large, contacts.shifts, delta)
     further, beyond = on_any(world.comm, *gone)
@@ -204,13 +200,13 @@ def find_overrun(
         return None
     shifts = np.concatenate([contacts.shifts, dt * large[None]]) if beyond else contacts.shifts
     margin = np.maximum(seen, way)
-    unseen = find_contacts(world, delta, dt, margin, shifts, besides=contacts)
-    table = velocities_about(world, unseen.near, velocity, large)
+    unseen = find_contacts(world, delta, free, margin, shifts, contacts.lists, besides=contacts)
+    table = velocities_about(unseen, velocity, large)
     opening = _opening(world, unseen, unseen.near.bodies.position, table)
     overlap = -dt * (gap_velocities(world, unseen, dt, recovery_speed)[2] + opening)
     if not on_any(world.comm, bool((overlap > depth).any()))[0]:
         return None
-    return find_contacts(world, delta, dt, margin, shifts)
+    return find_contacts(world, delta, free, margin, shifts, unseen.lists)
 
 
 def _opening(world: World, contacts: Contacts, position: Floats, velocity: Floats) -> Floats:
@@ -223,9 +219,10 @@ def _opening(world: World, contacts: Contacts, position: Floats, velocity: Float
 
 
 def find_turned(
-    world: World, contacts: Contacts, velocity: Floats, dt: float, depth: float, recovery_speed: float, tried: int
-) -> Contacts | None:
-    """The contacts, with those that overlap by more than `depth` [m] if bodies go on for dt [s] with these velocities
+    world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats, depth: float,
+    recovery_speed: float, tried: int,
+) -> Contacts | None:  # fmt: skip
+    """The contacts, with those that overlap by more than `depth` [m] if bodies go on for a step with these velocities
     (owned, 6); None if there are none, or if the grains that are no spheres turn by less than that; collective.
 
     A step takes the gap of a contact as linear in the velocities. Where bodies turn, its point and its normal move, and
@@ -235,9 +232,10 @@ def find_turned(
     turns between two features would go to and fro for ever: a linearisation with another normal then stays, and the new
     one is a contact beside it.
     """
+    dt = free.dt
     if not _turn(world, velocity[: len(world.grains)], dt, depth):
         return None
-    end = find_contacts(advanced(world, velocity, dt, contacts.lag), 0.0)
+    end = find_contacts(advanced(world, free, contacts, velocity), 0.0)
     end = end.take(end.gap < -depth)
     start, approach = _at_start(world, end, dt)
     overlap = -(dt * gap_velocities(world, start, dt, recovery_speed)[2] + approach)

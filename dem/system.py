@@ -22,19 +22,8 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies, stiffness
-from dem.applied import (
-    Drives,
-    applied_impulses,
-    drives_of,
-    free_directions,
-    free_velocities,
-    joint_coupling,
-    joints_refound,
-    slots,
-)
 from dem.arrays import Floats, Ints, Keys, places
 from dem.bodies import Bodies
-from dem.checks import positive
 from dem.cohesion import along_normal, attraction
 from dem.compiled import loop
 from dem.contact import Contacts
@@ -43,11 +32,13 @@ from dem.contact_map.cell import CellMap
 from dem.contact_map.jointed import JointedMap
 from dem.contact_map.loops import closing, scale
 from dem.contact_map.map import packed
+from dem.drives import Drives, free_directions
 from dem.free_motion import kept_spin
 from dem.joints import Coupling
 from dem.rolling import resistance
 from dem.servo import cell_of
 from dem.surface import surface_velocities
+from dem.unconstrained import UnconstrainedMotion, free_velocities, joint_coupling, joints_refound, slots
 from dem.world import World, turns_unlike_spheres
 
 #: Bodies that contacts turned by more radians in the last step were struck: those impulses do not come again.
@@ -61,6 +52,8 @@ class ContactSystem:
 
     Attributes, of nc local contacts and of the bodies whose rows this rank owns (`World.owned`):
         dt (float): step [s]
+        motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`
+        contacts: as the search found them
         key (nc,), mu (nc,), point (nc, 3): contact key, friction coefficient, contact point [m]
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
@@ -91,26 +84,26 @@ class ContactSystem:
     """
 
     def __init__(
-        self, world: World, contacts: Contacts, dt: float, recovery_speed: float = np.inf,
-        joints: Coupling | None = None, spent: Ints | None = None, expected: Floats | None = None,
-        push: Floats | None = None, eased: tuple[Keys, Floats] | None = None,
+        self, world: World, contacts: Contacts, motion: UnconstrainedMotion, recovery_speed: float = np.inf,
+        joints: Coupling | None = None, expected: Floats | None = None, push: Floats | None = None,
+        eased: tuple[Keys, Floats] | None = None,
     ) -> None:  # fmt: skip
-        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `joints`,
-        `spent`: the joints of this step, and what `Drives` has by that name, if contacts have shown them. `expected`:
+        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `joints`: those
+        of this step, if contacts have shown them. `expected`:
         impulses (nc, 3) that the contacts are expected to have, as those of the last step; or `push` if it is known.
         `eased`: contacts that bounce with a part of e alone, by key, from the method of that name."""
-        positive("time step", dt)
+        dt = motion.dt
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
         near, owned = contacts.near, world.owned
-        self.dt, self.near = dt, near
+        self.dt, self.motion, self.contacts, self.near = dt, motion, contacts, near
         self.key, self.mu, self.point = contacts.key, contacts.friction, contacts.point
         self.frame = contact_frames(contacts.normal)
         moves = bodies.is_dynamic(near.bodies)
         # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
         row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
         arm = contact_arms(contacts, near.bodies.position, row)
-        self.drives = drives_of(world, dt, spent)
+        self.drives = motion.drives
         root = inverse_root_masses(world, self.drives)
         rows = CompactRows(self.frame.reshape(-1, 9), arm, body, root, owned)
         ghosts = np.flatnonzero(touched)
@@ -129,12 +122,12 @@ class ContactSystem:
             scale(self.contact_map.given.root, self.push, change)
             struck = dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
             self.push[struck], change[struck] = 0.0, 0.0
-        free, self.middle = free_velocities(world, near, dt, self.drives, change)
-        self.applied = applied_impulses(world, dt) if world.loaded else None
-        if world.loaded or change is not None:
+        free, self.middle = free_velocities(world, near, motion, change)
+        self.applied = motion.applied
+        if self.applied is not None or change is not None:
             halo.update(free)
         freely, rounding = closing(rows.frame, arm, row, free)
-        self.joints = joint_coupling(world, dt, self.push) if joints is None else joints
+        self.joints = joint_coupling(world, motion, self.push) if joints is None else joints
         if self.joints is not None:
             here, slot = slots(world, near.bodies.id)
             spin = self.joints.spin[slot]

@@ -16,7 +16,7 @@ from dem.clumps import Form
 from dem.contact_law import ContactLaw
 from dem.joints import Joint
 from dem.loads import Load
-from dem.motion import Dynamic, Fixed, Pose, checked_pose, velocity_between
+from dem.motion import Dynamic, Pose, checked_pose
 from dem.polyhedra import Solid
 from dem.scene import LargeBody
 from dem.sources import Outlet, Source, Tally, as_array
@@ -99,18 +99,8 @@ class World:
 
     lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
 
-    #: Of prescribed motions, by row: the poses at the two last times, and by time and dt [s] the mean velocities.
-    _poses: dict[float, dict[int, Pose]] = field(init=False, repr=False, default_factory=dict)
-    _followed: dict[tuple[float, float], dict[int, Floats]] = field(init=False, repr=False, default_factory=dict)
-
     #: Velocities (springs, 2, 6) that the ends of springs were to have after the last step without contacts and drives.
     expected: Floats | None = field(init=False, default=None)
-
-    #: By time and dt [s]: what loads and springs give in that step, a `dem.applied.Applied`.
-    applied: dict[tuple[float, float], Any] = field(init=False, repr=False, default_factory=dict)
-
-    #: Likewise what drives the large bodies, a `dem.applied.Drives`.
-    drives: dict[tuple[float, float], Any] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
@@ -135,7 +125,6 @@ class World:
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
         self.grains, self.lists = grains, None
-        self.act_anew()
         everyone = np.zeros((self.comm.size + 1, 2), np.int64)
         self.comm.Allgather(np.array([len(grains), (grains.shape != bodies.SPHERE).any()], np.int64), everyone[1:])
         self.slabs = np.cumsum(everyone[:, 0])
@@ -145,11 +134,6 @@ class World:
     def ids(self) -> int:
         """Number of grains that there have been; their ids are less."""
         return self.initial + sum(self.tallies[name].count for name in self.sources)
-
-    @property
-    def loaded(self) -> bool:
-        """Whether there are loads or springs."""
-        return bool(self.loads or self.springs)
 
     @property
     def body_count(self) -> int:
@@ -178,62 +162,19 @@ class World:
         row = self.large_row(body.name)
         self.large_bodies = (*self.large_bodies[:row], body, *self.large_bodies[row + 1 :])
         self.changed.add(("body", body.name))
-        self._poses, self._followed = {}, {}
-        self.act_anew()
-
-    def act_anew(self) -> None:
-        """Find anew what acts in this step: it is other than it was."""
-        self.applied, self.drives = {}, {}
-
-    def large_velocity(self, velocity: Floats, dt: float) -> Floats:
-        """Those (large, 6) of the large bodies, on all ranks, of the velocities (owned, 6) in the next step of dt [s]
-        of the bodies whose rows each rank owns; collective."""
-        if not bodies.is_dynamic(self.large).any():
-            return self.prescribed_velocity(dt)
-        large = np.zeros_like(self.large.velocity)
-        count = len(self.grains)
-        large[: len(velocity) - count] = velocity[count:]  # all of them on the last rank, none elsewhere
-        self.comm.Bcast(large, root=self.comm.size - 1)
-        return large
 
     def poses(self, time: float) -> dict[int, Pose]:
         """Places (3,) and quaternions (4,) of the large bodies of prescribed motion at `time` [s], by row; collective.
         SceneError if a motion fails."""
-        if time not in self._poses:  # the end of a step is the start of the next
-            self._keep(time, together(self.comm, "motion of a large body", lambda: self._each(time)))
-        return self._poses[time]
+        return together(self.comm, "motion of a large body", lambda: {
+            row: checked_pose(body.motion, time, body.position, body.quaternion)
+            for row, body in enumerate(self.large_bodies) if not isinstance(body.motion, Dynamic)
+        })  # fmt: skip
 
-    def prescribed_velocity(self, dt: float) -> Floats:
-        """Velocities (large bodies, 6) over the next step of `dt` [s]; dynamic bodies keep theirs; collective.
-        SceneError if a motion fails."""
-        asked = (self.time, dt)
-        if asked not in self._followed:  # a step asks several times
-            start = self.poses(self.time)
-
-            def follow() -> tuple[dict[int, Pose], dict[int, Floats]]:
-                end = self._poses.get(self.time + dt) or self._each(self.time + dt)
-                return end, {row: velocity_between(start[row], end[row], dt) for row in start}
-
-            end, means = together(self.comm, "motion of a large body", follow)
-            self._followed = {asked: means}
-            self._keep(self.time + dt, end)
-        velocity = self.large.velocity.copy()
-        for row, mean in self._followed[asked].items():
-            velocity[row] = mean
-        return velocity
-
-    def _keep(self, time: float, poses: dict[int, Pose]) -> None:
-        self._poses = {**dict([*self._poses.items()][-1:]), time: poses}
-
-    def _each(self, time: float) -> dict[int, Pose]:
-        known = next(reversed(self._poses.values()), {})
-        return {
-            row: known[row]
-            if row in known and isinstance(body.motion, Fixed)
-            else checked_pose(body.motion, time, body.position, body.quaternion)
-            for row, body in enumerate(self.large_bodies)
-            if not isinstance(body.motion, Dynamic)
-        }
+    def put_large(self, poses: dict[int, Pose]) -> None:
+        """Put large bodies, by row, into these poses."""
+        for row, pose in poses.items():
+            self.large.position[row], self.large.quaternion[row] = pose
 
 
 def turns_unlike_spheres(world: World) -> bool:

@@ -476,6 +476,7 @@ from dem.shapes import Plane
 from dem.start import new_world
 from dem.step import Step, advance
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 from pctt import ccp
 
 scene = Scene(friction=0.5, stiffness=np.inf)
@@ -483,8 +484,9 @@ scene.add_body("floor", [Plane(normal=(0, 0, 1))])
 scene.add_spheres([[0, 0, 0.1], [0, 0, 0.3]], 0.1, 2500.0)
 world, dt, memory = new_world(scene, MPI.COMM_SELF), 0.01, ImpulseMemory(MPI.COMM_SELF)
 for _ in range(3):
-    contacts = find_contacts(world, delta=0.02, dt=dt)
-    system = ContactSystem(world, contacts, dt, recovery_speed=1.0)
+    free = unconstrained(world, dt)
+    contacts = find_contacts(world, 0.02, free)
+    system = ContactSystem(world, contacts, free, recovery_speed=1.0)
     problem = ccp.ConeProblem(world.comm, system.r, system.mu, G=system.contact_map)
     result = ccp.solve(
         problem, memory.recall(contacts.key, system.frame)[0], "apgd", ccp.Limits(tol=1e-8), law=ccp.RELAXATION
@@ -492,7 +494,7 @@ for _ in range(3):
     memory.remember(contacts.key, result.impulse, system.frame)
     step = Step(world, contacts, system, result.impulse)
     print(len(contacts.gap), "contacts, the floor bears", round(-step.force_on("floor")[2], 3), "N")
-    advance(world, system.velocity(result.impulse), dt)
+    advance(world, free, contacts, system.velocity(result.impulse))
 
 # %% dem.contact_map.ContactMap, dem.contact_map.CompactRows, dem.contact_map.Halo, dem.neighbourhood.Neighbourhood
 import numpy as np
@@ -502,10 +504,12 @@ from dem.contact import find_contacts
 from dem.scenes import Belt
 from dem.start import new_world
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 
 world = new_world(Belt(n=2).build(), MPI.COMM_SELF)
-contacts = find_contacts(world, delta=0.01, dt=0.001)
-G = ContactSystem(world, contacts, 0.001).contact_map
+free = unconstrained(world, 0.001)
+contacts = find_contacts(world, 0.01, free)
+G = ContactSystem(world, contacts, free).contact_map
 g, v = np.ones((len(contacts.gap), 3)), np.ones((world.owned, 6))
 print("g'(G v) - (G'g)'v =", round(float((g * G.velocities(v)).sum() - (G.momenta(g) * v).sum()), 12))
 print(len(contacts.near.bodies), "bodies near this rank,", contacts.near.ghosts, "of them ghosts")

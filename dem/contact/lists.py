@@ -66,13 +66,11 @@ class Lists:
         return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
 
 
-def grain_lists(world: World, margin: Floats, way: Floats) -> Lists:
-    """Those of the last search if they hold for the margins (grains,) [m], else new ones for grains that go the `way`
-    (grains,) [m] in a step; collective."""
-    last = world.lists
-    if on_any(world.comm, last is None or not last.hold(world, margin))[0]:
-        world.lists = last = _new_lists(world, margin, way)
-    return last
+def grain_lists(world: World, last: Lists | None, margin: Floats, way: Floats) -> Lists:
+    """The lists of an earlier search if they hold for the margins (grains,) [m], else new ones for grains that go the
+    `way` (grains,) [m] in a step; collective."""
+    holds = last is not None and last.hold(world, margin)
+    return _new_lists(world, margin, way) if on_any(world.comm, not holds)[0] or last is None else last
 
 
 def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:

@@ -7,18 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dem import bodies
-from dem.applied import drives_of, free_directions, free_turns, grains_free_velocity
 from dem.arrays import Bools, Floats, Ints, Keys, places
 from dem.bodies import CAPSULE, CLUMP, MESH, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.ahead import Course
 from dem.contact.candidates import meeting
-from dem.contact.lists import grain_lists
+from dem.contact.lists import Lists, grain_lists
 from dem.contact.primitives import extents, touches, touches_ahead
+from dem.drives import free_directions, free_turns
 from dem.neighbourhood import Neighbourhood, refreshed
 from dem.period import Images, refuse_short
 from dem.quaternion import cross, length
+from dem.unconstrained import UnconstrainedMotion
 from dem.world import World
 
 #: Margin of a grain over the way that it goes in a step without contact forces: those that push it on often add a part.
@@ -43,12 +44,14 @@ class Contacts:
     friction: Floats  #: (nc,) coefficient
     near: Neighbourhood  #: the bodies of the rows `a` and `b`
     shifts: Floats  #: (k, large, 6) the ways and turns of the large bodies that the search reckoned with [m, rad]
+    owned: Floats  #: (grains,) how many contacts each of the local grains owns: the load of the balancer
+    lists: Lists  #: of pairs that are close, from which the search found the contacts
     #: (nc, 3) from body b to where it is in the contact, as seen from body a: to its image, and ahead to the end of the
     #: step; None: nowhere [m]
     moved: Floats | None = None
     linear: Floats | None = None  #: (nc,) the gaps from which gaps linear in the velocities start; None: `gap` [m]
-    #: (nc, 3) by how much the mean velocities along the surfaces in the step, of b relative to a, differ from those with
-    #: these arms, as bodies turn; None: nothing [m/s]
+    #: (nc, 3) by how much the mean velocities along the surfaces in the step, of b relative to a, differ from those
+    #: with these arms, as bodies turn; None: nothing [m/s]
     swing: Floats | None = None
     drift: Floats | None = None  #: (nc, 3) what the shear adds to the velocity of b relative to a; None: nothing [m/s]
     #: (nc,) the normal velocities after impacts that `dem.impacts` follows; -inf where two do not meet, NaN where
@@ -64,7 +67,7 @@ class Contacts:
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row per contact by name, without copies."""
-        left = {"near", "shifts", "lag", "held_overlap"}
+        left = {"near", "shifts", "owned", "lists", "lag", "held_overlap"}
         left |= {name for name in ("moved", "linear", "swing", "drift", "parting") if getattr(self, name) is None}
         return {name: value for name, value in vars(self).items() if name not in left}
 
@@ -92,30 +95,28 @@ class Contacts:
 
 
 def find_contacts(
-    world: World, delta: float, dt: float = 0.0, margin: Floats | float = 0.0, shifts: Floats | None = None,
-    besides: Contacts | None = None,
+    world: World, delta: float, free: UnconstrainedMotion | None = None, margin: Floats | float = 0.0,
+    shifts: Floats | None = None, lists: Lists | None = None, besides: Contacts | None = None,
 ) -> Contacts:  # fmt: skip
     """All contacts that this rank owns of the pairs whose margins meet; collective.
 
-    The margin of a body is delta/2 [m], or the way that it goes in dt [s] without contact forces, of a grain FURTHER
-    times that, if it is longer. So a gap of at most `delta` is a contact, and so is a wider one that may close within
-    the step, also when a third body stops one of the two. `margin` (grains,) [m] are the least margins of the local
-    grains, `shifts` (k, large, 6) [m, rad] further ways and turns of the large bodies that their margins are to cover.
-    A contact belongs to the rank that owns the body of lower global index. The numbers of contacts that the grains own
-    are left in `world.grains.weight`.
-
-    With `besides`, contacts that a search with margins not greater has found, only those are found that are not among
-    them, and the weights stay.
+    The margin of a body is delta/2 [m], or the way that it goes in a step of the motion `free` without contacts, of a
+    grain FURTHER times that, if it is longer; None: where bodies are, not where they will be. So a gap of at most
+    `delta` is a contact, and so is a wider one that may close within the step, also when a third body stops one of the
+    two. `margin` (grains,) [m] are the least margins of the local grains, `shifts` (k, large, 6) [m, rad] further ways
+    and turns of the large bodies that their margins are to cover. A contact belongs to the rank that owns the body of
+    lower global index. `lists`: those of an earlier search that may hold; None: those of the world. With `besides`,
+    contacts that a search with margins not greater has found, only those are found that are not among them.
     """
     not_negative("contact distance delta", delta)
+    dt, velocity = (0.0, world.grains.velocity) if free is None else (free.dt, free.grains)
     if shifts is None:
-        shifts = (dt * drives_of(world, dt).free if dt else np.zeros_like(world.large.velocity))[None]
-    free = grains_free_velocity(world, dt) if dt else world.grains.velocity
-    way = ways(world.grains.shape, world.grains.size, free, FURTHER * dt)
+        shifts = (np.zeros_like(world.large.velocity) if free is None else dt * free.drives.free)[None]
+    way = ways(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
     way = way + cell_way(world, dt)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
     refuse_short(world, margin)
-    lists = grain_lists(world, margin, way)
+    lists = grain_lists(world, world.lists if lists is None else lists, margin, way)
     base = near = refreshed(lists.near, lists.halo, world, margin)
     grown = _grown(base, shifts, besides)
     pictures = lists.images
@@ -133,19 +134,19 @@ def find_contacts(
     moved: Floats | None = None
     swing: Floats | None = None
     linear: Floats | None = None
-    if dt:
-        motions = _motions(world, near, pictures, dt)
-        course = Course(near.bodies.position, motions, bodies.is_dynamic(near.bodies), dt)
+    if free is not None:
+        motions = _motions(world, near, pictures, free.prescribed)
+        course = Course(near.bodies.position, motions, bodies.is_dynamic(near.bodies), free.dt)
         (pair, feature, touch), moved, swing, linear = touches_ahead(table, i, j, reach, course)
     else:
         pair, feature, touch = touches(table, i, j, reach)
-    key, a, b, body, friction, weight = named(
+    key, a, b, body, friction, owned = named(
         *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
         *(table.hulls.features, near.grains, i, j, pair, feature),
     )
-    contacts = Contacts(key, a, b, body, *touch, friction, near, shifts, moved, linear, swing)
+    contacts = Contacts(key, a, b, body, *touch, friction, near, shifts, owned, lists, moved, linear, swing)
     if pictures is not None:
-        contacts, weight = _without_images(world, contacts, base, pictures)
+        contacts = _without_images(world, contacts, base, pictures)
     back = np.flatnonzero(pair[1:] <= pair[:-1])  # other shapes come behind the spheres, and touch in several points
     of_clumps = table.members is not None
     if (len(back) or of_clumps) and lists.images is None:
@@ -154,9 +155,7 @@ def find_contacts(
         order = contact_order(world, near, a[left], b[left], key[left])
         for column in contacts.columns().values():
             column[left] = column[left].take(order, axis=0)
-    if besides is None:
-        world.grains.weight = weight
-    else:
+    if besides is not None:
         contacts = contacts.take(places(besides.key, contacts.key) < 0)
     if not bodies.is_dynamic(world.large).any():
         return contacts
@@ -166,11 +165,11 @@ def find_contacts(
     return replace(contacts.take(~rigid), held_overlap=-float(contacts.gap[rigid].min(initial=0.0)))
 
 
-def _motions(world: World, near: Neighbourhood, pictures: Images | None, dt: float) -> Floats:
-    """Velocities (rows, 6) before the step of dt [s] of the bodies of a neighbourhood, of prescribed ones those of the
-    step; images and centres have those that a cell gives them."""
+def _motions(world: World, near: Neighbourhood, pictures: Images | None, prescribed: Floats) -> Floats:
+    """Velocities (rows, 6) before the step of the bodies of a neighbourhood, of prescribed ones those of the step;
+    images and centres have those that a cell gives them."""
     velocity, seen = near.bodies.velocity.copy(), near.grains + near.ghosts
-    velocity[seen:] = world.prescribed_velocity(dt)
+    velocity[seen:] = prescribed
     if world.shear is not None and pictures is not None:
         velocity[:seen, 0] += world.shear.speed * pictures.boundaries(np.arange(seen))
     if world.servo is not None:
@@ -178,12 +177,13 @@ def _motions(world: World, near: Neighbourhood, pictures: Images | None, dt: flo
     return velocity
 
 
-def velocities_about(world: World, near: Neighbourhood, velocity: Floats, large: Floats) -> Floats:
-    """Velocities (rows, 6) of all bodies of the neighbourhood, from those (owned, 6) of the bodies whose rows each rank
-    owns and those (large, 6) of the large bodies; collective."""
+def velocities_about(contacts: Contacts, velocity: Floats, large: Floats) -> Floats:
+    """Velocities (rows, 6) of all bodies of the neighbourhood of contacts, from those (owned, 6) of the bodies whose
+    rows each rank owns and those (large, 6) of the large bodies; collective."""
+    near = contacts.near
     table = np.zeros((len(near.bodies), 6))
     table[: near.grains] = velocity[: near.grains]
-    world.lists.halo.update(table)
+    contacts.lists.halo.update(table)
     table[near.grains + near.ghosts :] = large
     return table
 
@@ -199,11 +199,8 @@ def cell_way(world: World, dt: float) -> Floats | float:
     return way
 
 
-def _without_images(
-    world: World, contacts: Contacts, near: Neighbourhood, images: Images
-) -> tuple[Contacts, Floats]:
-    """The contacts of a table with images as contacts of the bodies of `near`, at the place of body a and in order, and
-    how many each of the local grains owns (grains,)."""
+def _without_images(world: World, contacts: Contacts, near: Neighbourhood, images: Images) -> Contacts:
+    """The contacts of a table with images as contacts of the bodies of `near`, at the place of body a and in order."""
     (a, way), (b, moved) = images.place(contacts.a), images.place(contacts.b)
     moved = moved - way
     if contacts.moved is not None:
@@ -212,9 +209,9 @@ def _without_images(
     if world.shear is not None:
         boundaries = images.boundaries(contacts.b) - images.boundaries(contacts.a)
         found = replace(found, drift=np.outer(world.shear.speed * boundaries, (1.0, 0.0, 0.0)))
-    owned = np.minimum(a, b)
-    weight = np.bincount(owned[owned < near.grains], minlength=near.grains).astype(float)
-    return found.take(contact_order(world, near, a, b, contacts.key)), weight
+    owner = np.minimum(a, b)
+    owned = np.bincount(owner[owner < near.grains], minlength=near.grains).astype(float)
+    return replace(found.take(contact_order(world, near, a, b, contacts.key)), owned=owned)
 
 
 def _grown(near: Neighbourhood, shifts: Floats, besides: Contacts | None) -> Bools:

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from dem.applied import joint_ends
 from dem.arrays import Floats
-from dem.joints import HOLDS, Geometry, Joint, geometry
+from dem.joints import HOLDS, Geometry, Joint
 from dem.together import meet
+from dem.unconstrained import joints_now
 
 
 class JointNow:
@@ -25,15 +25,11 @@ class JointNow:
 
     @property
     def _now(self) -> tuple[Joint, Geometry, Floats]:
-        """The joint, its geometry, and the velocities (6,) of its second end relative to the first."""
+        """The joint, the geometry of all, and the velocities (6,) of its second end relative to the first."""
         meet(self._sim.comm, f"joint {self.name}")
-        world = self._sim.world
-        joint = world.joints[self.name]
-        _, row, ends = joint_ends(world, self._sim.settings.dt)
-        row = row[self._number : self._number + 1]
-        found = geometry([joint], row, ends, world.period)
-        velocity = np.einsum("wsx,sx->w", found.rows[0], ends.velocity[row[0]])
-        return joint, found, velocity
+        found, velocity = joints_now(self._sim.world)
+        relative = np.einsum("wsx,sx->w", found.rows[self._number], velocity[self._number])
+        return self._sim.world.joints[self.name], found, relative
 
     @property
     def force(self) -> Floats:
@@ -78,7 +74,7 @@ class JointNow:
         joint, found, _ = self._now
         if joint.kind != kind:
             raise ValueError(f"joint {self.name!r} is a {joint.kind}, and no {kind}")
-        return float(found.error[0, joint.way])
+        return float(found.error[self._number, joint.way])
 
     @property
     def _impulses(self) -> Floats:

@@ -22,6 +22,7 @@ from dem.period import put_back
 from dem.step import advance, carried, find_overrun, find_turned
 from dem.system import ContactSystem, contact_frames
 from dem.together import SceneError
+from dem.unconstrained import UnconstrainedMotion, large_velocity, unconstrained
 from dem.world import World
 from pctt import ccp, log
 from pctt.ccp.cones import Array, Cones
@@ -42,6 +43,7 @@ class Stepper:
     """
 
     contacts: Contacts
+    motion: UnconstrainedMotion
     system: ContactSystem
     impulse: np.ndarray
     moment: np.ndarray | None  #: where contacts resist rolling or spinning
@@ -58,9 +60,8 @@ class Stepper:
         self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
         self._problem: ccp.ConeProblem | None = None
         self._corrections = 0  # of the present step
-        # what joints hold and what drives give in the present step, once its contacts have shown it, and how often
+        # what joints hold in the present step, once its contacts have shown it, and how often
         self._joints: Coupling | None = None
-        self._spent: Ints | None = None
         self._push: Array | None = None  # momenta that the contacts of the present step are expected to give
         self._shown = 0
         self._slabs: Ints | None = None  # those of the last step, or of a solution that is remembered within this one
@@ -100,14 +101,15 @@ class Stepper:
             raise
 
     def _step(self) -> dict[str, Any]:
-        self._corrections, self._shown, self._joints, self._spent, self._push = 0, 0, None, None, None
+        self._corrections, self._shown, self._joints, self._push = 0, 0, None, None
         self._eased: tuple[Keys, Array] | None = None
         with log.phase("search"):
             come_and_go(self.world)
             put_back(self.world)
             rebalance(self.world)
-            contacts = find_contacts(self.world, self.settings.delta, self.settings.dt)
-            contacts = in_order(self.world, contacts, self.settings.dt)
+            self.motion = unconstrained(self.world, self.settings.dt)
+            contacts = find_contacts(self.world, self.settings.delta, self.motion)
+            contacts = in_order(self.world, contacts, self.motion)
         problem, guess, result = self._solved(contacts)
         with log.phase("output"):
             files = self.dump.step(self.system, problem, guess, result, result.asked or result) if self.dump else {}
@@ -123,7 +125,7 @@ class Stepper:
             self.system.take_flow(self.world, self.contacts)
             velocity = self.system.velocity_with(result.momentum)
             kept = self.system.kept(self.world, velocity) if self.system.middle is not None else None
-            advance(self.world, velocity, self.settings.dt, self.contacts.lag, kept)
+            advance(self.world, self.motion, self.contacts, velocity, kept)
             kept = self.system.held_after(result.impulse)  # with which springs begin the next step
             self.memory.remember(self.system.key, kept, self.system.frame)
             self._slabs = self.world.slabs
@@ -175,7 +177,7 @@ class Stepper:
         """The problem of these contacts, which takes the place of the last, and a guess: the impulses of the last step,
         or those found within this one."""
         self._release()
-        given = self.settings.dt, self.settings.recovery_speed, self._joints, self._spent
+        given = self.motion, self.settings.recovery_speed, self._joints
         within = self._push, self._eased
         with log.phase("assembly"):
             place = contacts.key, contact_frames(contacts.normal)
@@ -190,23 +192,23 @@ class Stepper:
     def _unseen(self, momentum: Array) -> Contacts | None:
         """The present contacts, with those that these momenta show to be missed; None if there are none. Three times a
         step at most with those that overlap at its end because bodies turn, by a tenth of delta."""
-        world, settings, contacts = self.world, self.settings, self.contacts
+        world, settings, contacts, motion = self.world, self.settings, self.contacts, self.motion
         delta, dt, recovery = settings.delta, settings.dt, settings.recovery_speed
         with log.phase("search"):
             velocity = self.system.velocity_with(momentum)
             self.system.set_rate(world, momentum)
             left = dt * settings.limits.closing_speed  # what a solution may leave of an overlap
             deep = max(0.01 * delta, left if left < np.inf else 0.0)
-            wider = find_overrun(world, contacts, velocity, delta, dt, deep, recovery)
+            wider = find_overrun(world, motion, contacts, velocity, delta, deep, recovery)
             if wider is not None:
-                wider = in_order(world, wider, dt)
+                wider = in_order(world, wider, motion)
                 return carried(world, contacts, wider) if self._corrections else wider
             if self._corrections < 3 and not world.only_spheres:
-                turned = find_turned(world, contacts, velocity, dt, 0.1 * delta, recovery, self._corrections)
+                turned = find_turned(world, motion, contacts, velocity, 0.1 * delta, recovery, self._corrections)
                 if turned is not None:
                     self._corrections += 1
                     return turned
-            refuse_passages(world, contacts, velocity, delta, dt)
+            refuse_passages(world, motion, contacts, velocity, delta)
             return None
 
     def _remembered(self, found: ccp.Result) -> ImpulseMemory:
@@ -224,11 +226,11 @@ class Stepper:
             joints, spent = self._joints_with(result), None
             if self.system.drives.most.any():
                 velocity = self.system.velocity_with(result.momentum)
-                spent = self.system.spent_with(self.world.large_velocity(velocity, self.settings.dt))
+                spent = self.system.spent_with(large_velocity(self.world, self.motion, velocity))
         if joints is None and spent is None:
             return True
         self._joints = self._joints if joints is None else joints
-        self._spent = self._spent if spent is None else spent
+        self.motion = self.motion if spent is None else self.motion.with_spent(self.world, spent)
         self._shown += 1
         return False
 

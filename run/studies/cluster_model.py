@@ -26,6 +26,7 @@ from dem.contact_map.halo import Halo, Messages
 from dem.morton import morton_codes
 from dem.partition import frame_of_most, redistribute, splitters
 from dem.scenes import Mixer
+from dem.unconstrained import unconstrained
 from dem.world import World
 from pctt import ccp
 from pctt.ccp.newton.fronts import Fronts
@@ -100,10 +101,10 @@ def counted(n: int, times: list[int]) -> list[Row]:
     sim = settled(Mixer(n=n))
     rows: list[Row] = []
     for world in (sim.world, copies(sim.world, times)):
-        redistribute(world)
-        find_contacts(world, sim.settings.delta, sim.settings.dt)
-        redistribute(world)
-        contacts = find_contacts(world, sim.settings.delta, sim.settings.dt)
+        for _ in range(2):  # the second time with the contacts of the first
+            redistribute(world)
+            contacts = find_contacts(world, sim.settings.delta, unconstrained(world, sim.settings.dt))
+            world.lists, world.grains.weight = contacts.lists, contacts.owned
         body = moving(world, contacts)
         for ranks in (2**k for k in range(1, 11) if 2**k * FEW <= len(world.grains)):
             found = pieces(world, body, ranks)

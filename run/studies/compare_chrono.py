@@ -53,6 +53,7 @@ from dem.scenes import Mixer
 from dem.shapes import Box, Plane
 from dem.start import new_world
 from dem.system import ContactSystem, contact_frames
+from dem.unconstrained import unconstrained
 from dem.world import World
 from pctt import ccp
 
@@ -107,7 +108,7 @@ class Step(NamedTuple):
 def assembled(state: State, contacts: Contacts) -> Step:
     """The cone problem of the step, with arms that end on the surfaces of the bodies."""
     world, dt = state.world, state.dt
-    system = ContactSystem(world, contacts, dt)
+    system = ContactSystem(world, contacts, unconstrained(world, dt))
     half = 0.5 * contacts.gap[:, None] * contacts.normal
     position = contacts.near.bodies.position
     arms = [contacts.point - half - position[contacts.a], contacts.point + half - position[contacts.b]]
@@ -164,7 +165,7 @@ def _boxes(world: World, dt: float) -> np.ndarray:
     low, high = world.grains.position.min(axis=0), world.grains.position.max(axis=0)
     middle, reach = (low + high) / 2, float(np.linalg.norm(high - low)) + 1.0
     rows = []
-    for row, velocity in enumerate(world.prescribed_velocity(dt)):
+    for row, velocity in enumerate(unconstrained(world, dt).prescribed):
         body = world.large_bodies[row]
         (part,) = body.shapes
         place, turn = world.large.position[row], world.large.quaternion[row]

@@ -43,6 +43,7 @@ from shared import (
 
 from dem.contact import find_contacts
 from dem.scenes import Mixer
+from dem.unconstrained import unconstrained
 from pctt import ccp
 from pctt.ccp import fclib
 from pctt.ccp.fclib import FileFormatError
@@ -179,7 +180,7 @@ def step_problem(n: int, variant: str, stiffness: float) -> ccp.ConeProblem:
         grains.position[:, 2] *= 1.01
         grains.velocity[:, :3] += 0.5 * rng.normal(size=(len(grains), 3)) - np.array([0, 0, 0.5])
     sim.world.pairs.stiffness[:] = stiffness
-    contacts = find_contacts(sim.world, settings.delta, settings.dt)
+    contacts = find_contacts(sim.world, settings.delta, unconstrained(sim.world, settings.dt))
     if variant == "friction":
         contacts.friction[:] = 0.8
     if variant == "heavy":

@@ -215,12 +215,14 @@ def next_problem(sim: Any, contacts: Any = None) -> Any:
     """The `pctt.ccp.ConeProblem` of the next step of a simulation, of these contacts if they are known."""
     from dem.contact import find_contacts
     from dem.system import ContactSystem
+    from dem.unconstrained import unconstrained
     from pctt.run.stepper import cone_problem
 
     world, settings = sim.world, sim.settings
+    free = unconstrained(world, settings.dt)
     if contacts is None:
-        contacts = find_contacts(world, settings.delta, settings.dt)
-    return cone_problem(ContactSystem(world, contacts, settings.dt, settings.recovery_speed), world.comm)
+        contacts = find_contacts(world, settings.delta, free)
+    return cone_problem(ContactSystem(world, contacts, free, settings.recovery_speed), world.comm)
 
 
 FIELDS = dict.fromkeys(("dt", "tol", "closing_work", "closing_speed", "stiffness"), float)

@@ -14,6 +14,7 @@ from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
 from dem.step import advance
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 from dem.world import World
 
 
@@ -98,8 +99,8 @@ def crude_impulse(system: ContactSystem) -> Floats:
 
 def step(world: World, dt: float = 0.005, delta: float = 0.02) -> Contacts:
     contacts = find_contacts(world, delta)
-    system = ContactSystem(world, contacts, dt, recovery_speed=0.5)
-    advance(world, system.velocity(crude_impulse(system)), dt)
+    system = ContactSystem(world, contacts, unconstrained(world, dt), recovery_speed=0.5)
+    advance(world, system.motion, system.contacts, system.velocity(crude_impulse(system)))
     return contacts
 
 

@@ -15,6 +15,7 @@ from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 
 
 def mixed(comm):
@@ -52,7 +53,7 @@ def test_products_are_those_of_the_definition(case, threads):
     comm = MPI.COMM_WORLD
     make, width = CASES[case]
     world = make(comm)
-    system = ContactSystem(world, find_contacts(world, 0.03), 0.01)
+    system = ContactSystem(world, find_contacts(world, 0.03), unconstrained(world, 0.01))
     G, bodies = system.contact_map, bodies_of(system)
     assert comm.allreduce(len(system.key)) > 40
     assert G.given.root.shape == (world.owned, width)
@@ -98,7 +99,7 @@ def test_a_product_sends_one_message_to_each_rank_that_shares_a_ghost():
     """As docs/cluster.md counts them: momenta to the owners of ghosts, velocities to the ranks that have ghosts."""
     comm = Counting(MPI.COMM_WORLD)
     world = new_world(heap(3, side=4, large=False), MPI.COMM_WORLD)
-    system = ContactSystem(world, find_contacts(world, 0.05), 0.01)
+    system = ContactSystem(world, find_contacts(world, 0.05), unconstrained(world, 0.01))
     given = system.contact_map.given
     starts = offsets(MPI.COMM_WORLD, given.columns)
     owners = set(np.searchsorted(starts, given.body[given.body >= 0], side="right") - 1) - {comm.rank}

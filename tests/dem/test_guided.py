@@ -14,6 +14,7 @@ from dem.shapes import Box, Plane
 from dem.start import new_world
 from dem.step import advance
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF
 SLANT = (1.0, 0.0, 2.0)
@@ -30,7 +31,7 @@ def pressed(motion, **options):
 
 
 def system_of(world):
-    return ContactSystem(world, find_contacts(world, 0.02), 0.01)
+    return ContactSystem(world, find_contacts(world, 0.02), unconstrained(world, 0.01))
 
 
 @pytest.mark.parametrize("direction", [(0, 0, 1), SLANT])
@@ -47,7 +48,7 @@ def test_only_the_motion_along_the_guide_answers_to_forces(direction):
     velocity = system.velocity(impulse)[5]
     np.testing.assert_allclose(velocity, [*(speed * unit), 0, 0, 0], atol=1e-13)
     turn = world.large.quaternion[1].copy()
-    advance(world, system.velocity(impulse), 0.01)
+    advance(world, system.motion, system.contacts, system.velocity(impulse))
     np.testing.assert_array_equal(world.large.quaternion[1], turn)
     np.testing.assert_allclose(world.large.position[1], [0.1, 0.1, 0.25] + 0.01 * speed * unit, atol=1e-14)
 
@@ -63,7 +64,8 @@ def test_what_holds_a_guided_body_across_its_guide_makes_no_contact():
     assert len(contacts) > 0
     assert set(map(tuple, contacts.body)) == {(2, 3)}  # the stop and the press
     np.testing.assert_allclose(np.abs(contacts.normal), [[0, 0, 1]] * len(contacts), atol=1e-12)
-    step = ContactSystem(new_world(scene, SELF), contacts, 0.01)
+    world = new_world(scene, SELF)
+    step = ContactSystem(world, contacts, unconstrained(world, 0.01))
     rows = dense_scaled_map(step, SELF)[::3]
     assert (rows**2).sum(axis=1).min() > 0  # no normal impulse without effect
 

@@ -18,6 +18,7 @@ from dem.shapes import Box, Mesh, Plane
 from dem.start import new_world, restored_world
 from dem.step import advance
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 
 DT = 0.005
 
@@ -84,36 +85,35 @@ def test_a_search_with_kept_lists_finds_what_a_fresh_one_finds(make):
         rebalance(world, 1.2)
         if n == 20:  # a restart
             world = restored_world(scene, comm, *world.state())
-        contacts = find_contacts(world, 0.01, DT)
-        made += world.lists is not lists
-        lists = world.lists
+        free = unconstrained(world, DT)
+        contacts = find_contacts(world, 0.01, free)
+        made += contacts.lists is not lists
+        lists = contacts.lists
         if n % 2:
-            assert_same(contacts, find_contacts(forgetful(world), 0.01, DT), comm.size)
+            assert_same(contacts, find_contacts(forgetful(world), 0.01, free), comm.size)
         if n % 10 == 3:  # as of a step in which a grain goes further than was seen
             margin = np.where(world.grains.id % 5 == 0, 0.05, 0.0)
-            wider = find_contacts(world, 0.01, DT, margin)
-            assert_same(wider, find_contacts(forgetful(world), 0.01, DT, margin), comm.size)
+            wider = find_contacts(world, 0.01, free, margin)
+            assert_same(wider, find_contacts(forgetful(world), 0.01, free, margin), comm.size)
             assert comm.allreduce(len(wider)) > comm.allreduce(len(contacts))
-            lists = world.lists
-        system = ContactSystem(world, contacts, DT, recovery_speed=0.5)
-        advance(world, system.velocity(crude_impulse(system)), DT)
+            contacts, lists = replace(contacts, lists=wider.lists), wider.lists
+        system = ContactSystem(world, contacts, free, recovery_speed=0.5)
+        advance(world, system.motion, system.contacts, system.velocity(crude_impulse(system)))
     assert comm.allreduce(len(contacts)) > 50
     assert 4 < made < 25  # else nothing was shown
 
 
 def test_other_grains_and_places_need_new_lists():
     world = new_world(among_walls(), MPI.COMM_SELF)
-    find_contacts(world, 0.01)
-    lists = world.lists
-    find_contacts(world, 0.01)
-    assert world.lists is lists
+    world.lists = lists = find_contacts(world, 0.01).lists
+    assert find_contacts(world, 0.01).lists is lists
     world.grains.position = world.grains.position + [0.2, 0.0, 0.0]
     moved = find_contacts(world, 0.01)
-    assert world.lists is not lists
+    assert moved.lists is not lists
     assert_same(moved, find_contacts(forgetful(world), 0.01), 1)
-    lists, world.grains.size = world.lists, 1.1 * world.grains.size
+    world.lists, world.grains.size = moved.lists, 1.1 * world.grains.size
     thick = find_contacts(world, 0.01)
-    assert world.lists is not lists
+    assert thick.lists is not moved.lists
     assert len(thick) > len(moved)
     world.set_grains(world.grains.take(slice(0, 50)))
     assert_same(find_contacts(world, 0.01), find_contacts(forgetful(world), 0.01), 1)

@@ -18,6 +18,7 @@ from dem.partition import rebalance
 from dem.start import new_world
 from dem.step import Step
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF
 R, G, DENSITY = 0.1, 9.81, 1000.0
@@ -193,7 +194,7 @@ def measured(comm):
     world = new_world(heap(), comm)
     rebalance(world)
     contacts = find_contacts(world, 0.05)
-    system = ContactSystem(world, contacts, 0.01)
+    system = ContactSystem(world, contacts, unconstrained(world, 0.01))
     data = Step(world, contacts, system, crude_impulse(system)).sample
     low, high = np.array([-1.0, -1, -1]), np.array([2.0, 2, 2])
     box, mask = Block(low, high), data.id % 2 == 0

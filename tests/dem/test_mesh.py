@@ -20,6 +20,7 @@ from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere, mass_properties, moved
 from dem.start import new_world
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 from pctt import ccp
 from pctt.run.stepper import cone_problem
 
@@ -306,10 +307,11 @@ def test_without_trimesh_a_mesh_has_contacts_but_no_mass_and_no_file(tmp_path, m
 def moved_on(world, steps, dt=0.01):
     """After each step by Coulomb's law the system and its impulses."""
     for _ in range(steps):
-        system = ContactSystem(world, find_contacts(world, 0.01, dt), dt)
+        free = unconstrained(world, dt)
+        system = ContactSystem(world, find_contacts(world, 0.01, free), free)
         with cone_problem(system, SELF) as problem:
             result = ccp.solve(problem, None, "apgd", ccp.Limits(1e-9), law=ccp.COULOMB)
-        advance(world, system.velocity(result.impulse), dt)
+        advance(world, system.motion, system.contacts, system.velocity(result.impulse))
         yield system, result.impulse
 
 
@@ -375,8 +377,8 @@ def test_keys_of_meshes_are_distinct():
     contacts = find_contacts(world, 0.05)
     assert len(contacts) > 128
     assert len(np.unique(contacts.key)) == len(contacts)
-    system = ContactSystem(world, contacts, 1e-9)
-    advance(world, system.velocity(crude_impulse(system)), 1e-9)
+    system = ContactSystem(world, contacts, unconstrained(world, 1e-9))
+    advance(world, system.motion, system.contacts, system.velocity(crude_impulse(system)))
     np.testing.assert_array_equal(np.sort(find_contacts(world, 0.05).key), np.sort(contacts.key))
 
 

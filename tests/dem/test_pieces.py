@@ -11,11 +11,12 @@ from dem.contact import find_contacts
 from dem.partition import redistribute
 from dem.start import new_world
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 
 
 def searched(comm):
     world = new_world(heap(3), comm)
-    find_contacts(world, 0.05)
+    world.grains.weight = find_contacts(world, 0.05).owned
     redistribute(world)
     return world, find_contacts(world, 0.05)
 
@@ -24,7 +25,7 @@ def searched(comm):
 def test_the_pieces_of_a_bed_are_what_as_many_ranks_have():
     comm = MPI.COMM_WORLD
     world, contacts = searched(comm)
-    G = ContactSystem(world, contacts, 0.01).contact_map
+    G = ContactSystem(world, contacts, unconstrained(world, 0.01)).contact_map
     asked, given = G.halo._owners, G.halo._holders
     here = {
         "contacts": len(contacts), "bodies": G.columns, "ghosts": len(G.halo.ghosts),

@@ -21,6 +21,7 @@ from dem.shapes import Plane, Sphere
 from dem.start import new_world
 from dem.step import advance
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF
 DT = 0.01
@@ -30,9 +31,9 @@ def made(world, solve=crude_impulse, dt=DT, delta=0.02):
     """A step of the world, its contacts rigid, with the impulses that `solve` finds."""
     world.pairs.stiffness[:] = np.inf
     contacts = find_contacts(world, delta)
-    system = ContactSystem(world, contacts, dt, recovery_speed=0.5)
+    system = ContactSystem(world, contacts, unconstrained(world, dt), recovery_speed=0.5)
     impulse = solve(system)
-    advance(world, system.velocity(impulse), dt)
+    advance(world, system.motion, system.contacts, system.velocity(impulse))
     return record.Step(world, contacts, system, impulse)
 
 

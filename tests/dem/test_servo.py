@@ -16,6 +16,7 @@ from dem.shapes import Box, Plane, Sphere, mass_properties
 from dem.start import new_world
 from dem.step import advance
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 from pctt import Simulation, ccp
 from pctt.run.stepper import cone_problem
 
@@ -33,10 +34,11 @@ def world_of(shapes, motion, gravity=(0, 0, -9.81), **options):
 
 def step(world, tol=1e-9, dt=DT):
     """One time step by Coulomb's law; the force on the tool."""
-    system = ContactSystem(world, find_contacts(world, 0.01, dt), dt)
+    free = unconstrained(world, dt)
+    system = ContactSystem(world, find_contacts(world, 0.01, free), free)
     with cone_problem(system, SELF) as problem:
         impulse = ccp.solve(problem, None, "apgd", ccp.Limits(tol), law=ccp.COULOMB).impulse
-    advance(world, system.velocity(impulse), dt)
+    advance(world, system.motion, system.contacts, system.velocity(impulse))
     return force_on(world, system, "tool", impulse)
 
 
@@ -93,7 +95,7 @@ def test_the_mass_scaled_map_of_a_hinged_body_has_one_direction():
     scene.add_body("tool", [Sphere(0.5)], Hinged(AXIS), density=100.0)
     scene.add_spheres([[0.6, 0, 0], [0, 0.601, 0]], 0.1, 1000.0)
     world = new_world(scene, SELF)
-    system = ContactSystem(world, find_contacts(world, 0.01), DT)
+    system = ContactSystem(world, find_contacts(world, 0.01), unconstrained(world, DT))
     rows = system.contact_map.block_rows
     blocks = rows.blocks[rows.indices == 2].reshape(-1, 6)
     np.testing.assert_array_equal(blocks[:, :3], 0.0)

@@ -13,6 +13,7 @@ from dem.scene import Scene
 from dem.start import new_world
 from dem.step import advance
 from dem.system import ContactSystem, contact_frames
+from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF
 RNG = np.random.default_rng(7)
@@ -35,7 +36,7 @@ def contacts(world):
 
 @pytest.fixture(scope="module")
 def system(world, contacts):
-    return ContactSystem(world, contacts, DT, recovery_speed=0.1)
+    return ContactSystem(world, contacts, unconstrained(world, DT), recovery_speed=0.1)
 
 
 def test_frames_are_right_handed_and_orthonormal():
@@ -53,10 +54,10 @@ def test_relative_velocity_is_the_rate_of_gaps_and_points(contacts):
     world = new_world(heap(3, side=4), SELF)
     for _ in range(20):
         step(world)
-    system = ContactSystem(world, contacts, DT)
+    system = ContactSystem(world, contacts, unconstrained(world, DT))
     velocity = RNG.normal(size=(world.owned, 6))
     fixed = len(world.grains) + np.flatnonzero(~bodies.is_dynamic(world.large))
-    velocity[fixed] = world.prescribed_velocity(1e-6)[fixed - len(world.grains)]
+    velocity[fixed] = unconstrained(world, 1e-6).prescribed[fixed - len(world.grains)]
     rate = (dense_map(system) @ velocity.ravel()).reshape(-1, 3)
 
     eps = 1e-6
@@ -65,7 +66,7 @@ def test_relative_velocity_is_the_rate_of_gaps_and_points(contacts):
         quaternion.rotate(quaternion.conjugate(before.quaternion[row]), contacts.point - before.position[row])
         for row in (contacts.a, contacts.b)
     ]
-    advance(world, velocity, eps)
+    advance(world, unconstrained(world, eps), contacts, velocity)
     after = find_contacts(world, 0.03)
     place = {key: i for i, key in enumerate(after.key)}
     same = np.array([place[key] for key in contacts.key])
@@ -92,7 +93,7 @@ def test_free_velocity_of_prescribed_bodies_is_the_mean_one(world, system):
     velocity = system.free_velocity[len(world.grains) :]
     np.testing.assert_array_equal(velocity[world.large_row("walls")], 0.0)
     blade = world.large_row("blade")
-    np.testing.assert_array_equal(velocity[blade], world.prescribed_velocity(DT)[blade])
+    np.testing.assert_array_equal(velocity[blade], unconstrained(world, DT).prescribed[blade])
     np.testing.assert_allclose(velocity[blade, 3:], [0, 0.3, 1.0], atol=1e-14)
     slab = world.large_row("slab")
     np.testing.assert_allclose(velocity[slab, :3] - world.large.velocity[slab, :3], DT * world.gravity)
@@ -113,14 +114,14 @@ def test_no_contacts_and_bad_arguments():
     scene.add_spheres([[0, 0, 5]], 0.1, 1000.0, velocity=(1, 0, 0))
     world = new_world(scene, SELF)
     contacts = find_contacts(world, 0.01)
-    system = ContactSystem(world, contacts, DT, 1.0)
+    system = ContactSystem(world, contacts, unconstrained(world, DT), 1.0)
     assert dense_map(system).shape == (0, 6)
     assert dense_scaled_map(system, SELF).shape == (0, 6)
     np.testing.assert_allclose(system.velocity(np.zeros((0, 3))), [[1, 0, -9.81 * DT, 0, 0, 0]])
     with pytest.raises(ValueError, match="time step must be positive"):
-        ContactSystem(world, contacts, 0.0)
+        ContactSystem(world, contacts, unconstrained(world, 0.0))
     with pytest.raises(ValueError, match="recovery speed"):
-        ContactSystem(world, contacts, DT, -1.0)
+        ContactSystem(world, contacts, unconstrained(world, DT), -1.0)
 
 
 @pytest.mark.parametrize(("approach", "counts"), [(1e-8, True), (1e-11, False)])
@@ -129,6 +130,6 @@ def test_only_what_is_more_than_rounding_closes(approach, counts):
     scene = Scene(friction=0.3, gravity=(0, 0, 0))
     scene.add_spheres([[0, 0, 0], [0.5, 0, 0]], 0.25, 1000.0, velocity=[[100.0, 0, 0], [100.0 - approach, 0, 0]])
     world = new_world(scene, SELF)
-    system = ContactSystem(world, find_contacts(world, 0.01), DT)
+    system = ContactSystem(world, find_contacts(world, 0.01), unconstrained(world, DT))
     assert system.r[0, 0] == pytest.approx(-approach if counts else 0.0, rel=1e-4, abs=0.0)
     assert not system.r[0, 1:].any()

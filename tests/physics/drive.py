@@ -20,6 +20,7 @@ from dem.shapes import Plane
 from dem.start import new_world
 from dem.step import advance
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 from dem.world import World
 from pctt import ccp
 from pctt.run.stepper import cone_problem
@@ -65,14 +66,15 @@ def steps(
         limits = ccp.Limits(1e-300, iterations, fallback=False)
     for _ in range(count):
         rebalance(world)
-        contacts = find_contacts(world, delta, dt)
-        system = ContactSystem(world, contacts, dt, recovery_speed)
+        free = unconstrained(world, dt)
+        contacts = find_contacts(world, delta, free)
+        system = ContactSystem(world, contacts, free, recovery_speed)
         problem = cone_problem(system, world.comm)
         result = ccp.solve(problem, None, solver, limits, law=law)
         problem.destroy()
         reached = f"{result.reason}, residual {result.residual:.1e}"
         assert result.converged or iterations, f"step {world.step + 1}: {reached}"
-        advance(world, system.velocity(result.impulse), dt)
+        advance(world, free, contacts, system.velocity(result.impulse))
         yield Step(world, contacts, system, result.impulse)
 
 

@@ -19,6 +19,7 @@ from dem.shapes import Box, Plane, Sphere
 from dem.start import new_world
 from dem.step import advanced
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 
 DENSITY = 2500.0
 EXACT = {"tol": 1e-10, "closing_work": np.inf, "stiffness": np.inf}
@@ -73,14 +74,15 @@ def test_where_velocities_stay_the_end_is_met(grains, floor, cell, kinds):
     """Normals are those that bodies have after the step, and linear gaps lead to the gaps that they have then."""
     dt = 0.002  # nothing goes further than FURTHEST
     world = crowd(grains, floor, **cell)
-    contacts = find_contacts(world, 0.06, dt)
-    velocity = np.concatenate([world.grains.velocity, world.prescribed_velocity(dt)])
-    start = find_contacts(world, 0.0, 0.0, contacts.near.margin[: len(world.grains)], contacts.shifts)
+    free = unconstrained(world, dt)
+    contacts = find_contacts(world, 0.06, free)
+    velocity = np.concatenate([world.grains.velocity, free.prescribed])
+    start = find_contacts(world, 0.0, None, contacts.near.margin[: len(world.grains)], contacts.shifts)
     assert {tuple(pair) for pair in start.body} <= {tuple(pair) for pair in contacts.body}
-    end = find_contacts(advanced(world, velocity, dt), 0.08)
+    end = find_contacts(advanced(world, free, contacts, velocity), 0.08)
     near = contacts.near.bodies.velocity.copy()
     near[len(world.grains) :] = velocity[len(world.grains) :]
-    opening = ContactSystem(world, contacts, dt).contact_map.relative_velocities(near)[:, 0]
+    opening = ContactSystem(world, contacts, free).contact_map.relative_velocities(near)[:, 0]
     if contacts.drift is not None:
         opening = opening + np.einsum("ci,ci->c", contacts.normal, contacts.drift)
     at = {key: k for k, key in enumerate(end.key)}
@@ -103,7 +105,8 @@ def test_no_gap_is_deeper_than_the_bodies_overlap():
     scene = Scene(0.3, gravity=(0, 0, 0))
     scene.add_body("block", [Box((0.1, 0.1, 0.1))])
     scene.add_boxes([0.151, 0, 0.145], (0.05, 0.05, 0.05), DENSITY, velocity=(0, 0, 1.0))
-    contacts = find_contacts(new_world(scene, MPI.COMM_SELF), 0.01, 0.02)
+    world = new_world(scene, MPI.COMM_SELF)
+    contacts = find_contacts(world, 0.01, unconstrained(world, 0.02))
     assert contacts.linear.min() < -0.003
     np.testing.assert_allclose(contacts.gap, 0.001, atol=1e-12)
 

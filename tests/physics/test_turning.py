@@ -17,6 +17,7 @@ from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world
 from dem.step import advanced, find_turned
+from dem.unconstrained import unconstrained
 from pctt.simulation import Simulation
 
 DT, DELTA = 0.01, 0.1 * RADIUS
@@ -63,17 +64,18 @@ def test_a_lever_stops_with_its_tip_on_the_floor(angle):
 def test_bodies_that_keep_apart_are_left_alone():
     """Far from each other, or turning less than the overlap that is allowed, or spheres."""
     world = new_world(spinning("boxes", 1 / 3), MPI.COMM_SELF)
-    contacts, velocity = find_contacts(world, DELTA, DT), np.concatenate([world.grains.velocity, np.zeros((1, 6))])
-    assert find_turned(world, contacts, velocity, DT, 0.01 * RADIUS, np.inf, 0) is None
-    assert find_turned(world, contacts, 100 * velocity, DT, 100 * RADIUS, np.inf, 0) is None
+    free, velocity = unconstrained(world, DT), np.concatenate([world.grains.velocity, np.zeros((1, 6))])
+    contacts = find_contacts(world, DELTA, free)
+    assert find_turned(world, free, contacts, velocity, 0.01 * RADIUS, np.inf, 0) is None
+    assert find_turned(world, free, contacts, 100 * velocity, 100 * RADIUS, np.inf, 0) is None
     assert world.step == 0
-    assert find_turned(world, contacts, np.nan * velocity, DT, 0.01 * RADIUS, np.inf, 0) is None
+    assert find_turned(world, free, contacts, np.nan * velocity, 0.01 * RADIUS, np.inf, 0) is None
 
 
 def test_the_gap_at_the_start_leads_to_that_of_the_end():
     """With velocities that send grains into each other: gap + dt times normal velocity is the gap of the end."""
     world, contacts, velocity, found = found_of(MPI.COMM_SELF)
-    end = find_contacts(advanced(world, velocity, DT), 0.0)
+    end = find_contacts(advanced(world, unconstrained(world, DT), contacts, velocity), 0.0)
     new = found.take(np.isin(found.key, end.key) & ~np.isin(found.key, contacts.key))
     assert len(new) > 0
     assert set(contacts.key) <= set(found.key)
@@ -114,15 +116,16 @@ def test_a_second_linearisation_of_another_direction_stands_beside_the_first():
     sim.step()
     world, depth = sim.world, 1e-3
     velocity = world.grains.velocity
-    first = find_turned(world, find_contacts(world, 0.02, 1.0), velocity, 1.0, depth, np.inf, 0)
+    free = unconstrained(world, 1.0)
+    first = find_turned(world, free, find_contacts(world, 0.02, free), velocity, depth, np.inf, 0)
     for angle, stands in ((0.01, False), (0.4, True)):
         turn = quaternion.exponential(angle * np.eye(3)[:1])
         turned = replace(first, normal=quaternion.rotate(np.repeat(turn, len(first), axis=0), first.normal))
-        again = find_turned(world, turned, velocity, 1.0, depth, np.inf, 1)
+        again = find_turned(world, free, turned, velocity, depth, np.inf, 1)
         assert set(turned.key) <= set(again.key)
         assert (len(again) > len(turned)) == stands
         assert len(set(again.key)) == len(again)
-        assert len(find_turned(world, turned, velocity, 1.0, depth, np.inf, 0)) == len(turned)
+        assert len(find_turned(world, free, turned, velocity, depth, np.inf, 0)) == len(turned)
 
 
 def found_of(comm):
@@ -131,8 +134,9 @@ def found_of(comm):
     world = new_world(spinning("capsules", 2.0, pitch=2.02), comm)
     world.grains.velocity *= [12, 12, 12, 1, 1, 1]
     velocity = np.concatenate([world.grains.velocity, np.zeros((world.owned - len(world.grains), 6))])
-    contacts = find_contacts(world, DELTA, DT)
-    found = find_turned(world, contacts, velocity, DT, 0.01 * RADIUS, np.inf, 0)
+    free = unconstrained(world, DT)
+    contacts = find_contacts(world, DELTA, free)
+    found = find_turned(world, free, contacts, velocity, 0.01 * RADIUS, np.inf, 0)
     return world, contacts, velocity, found
 
 

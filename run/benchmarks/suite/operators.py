@@ -10,6 +10,7 @@ from shared import next_problem, settled
 from dem.contact import find_contacts
 from dem.scenes import SCENES
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 from pctt import ccp
 from pctt.body_matrix import BodyOperator
 
@@ -41,7 +42,8 @@ class Mixer:
         self.sim.close()
 
     def find(self):
-        return find_contacts(self.sim.world, self.sim.settings.delta, self.sim.settings.dt)
+        free = unconstrained(self.sim.world, self.sim.settings.dt)
+        return find_contacts(self.sim.world, self.sim.settings.delta, free)
 
     def time_velocities(self) -> None:
         self.problem.contact_map.velocities(self.v)
@@ -60,7 +62,8 @@ class Mixer:
 
     def time_assembly(self) -> None:
         settings = self.sim.settings
-        ContactSystem(self.sim.world, self.contacts, settings.dt, settings.recovery_speed)
+        free = unconstrained(self.sim.world, settings.dt)
+        ContactSystem(self.sim.world, self.contacts, free, settings.recovery_speed)
 
     def time_residual(self) -> None:
         self.problem.natural_residual(self.g, self.y)

@@ -15,6 +15,7 @@ from dem.shapes import Plane, Shape
 from dem.start import new_world
 from dem.step import advance
 from dem.system import ContactSystem
+from dem.unconstrained import unconstrained
 from dem.world import World
 from pctt import ccp
 from pctt.run.stepper import cone_problem
@@ -38,13 +39,14 @@ def moved(scene: Scene, seconds: float, until: Callable[[World], bool] = lambda 
     world = new_world(scene, MPI.COMM_SELF)
     while world.time < seconds - 1e-9 and not until(world):
         system, impulse = solved(world)
-        advance(world, system.velocity(impulse), DT)
+        advance(world, system.motion, system.contacts, system.velocity(impulse))
     return world
 
 
 def solved(world: World, guess: np.ndarray | None = None) -> tuple[ContactSystem, np.ndarray]:
     """The contact problem of the next step and its impulses (nc, 3)."""
-    system = ContactSystem(world, find_contacts(world, 0.001, DT), DT)
+    free = unconstrained(world, DT)
+    system = ContactSystem(world, find_contacts(world, 0.001, free), free)
     with cone_problem(system, world.comm) as problem:
         result = ccp.solve(problem, guess, "apgd", ccp.Limits(1e-9), law=ccp.COULOMB)
     return system, result.impulse
@@ -120,7 +122,7 @@ def stack(count: int = 5) -> list[Row]:
     world = new_world(scene, MPI.COMM_SELF)
     weight = 8 * RADIUS**3 * 1000.0 * G
     system, _ = solved(world)
-    contacts = find_contacts(world, 0.001, DT)
+    contacts = find_contacts(world, 0.001, unconstrained(world, DT))
     face = np.rint(contacts.point[:, 2] / (2 * RADIUS)).astype(int)
     borne, corners = [], []
     for seed in (0, 1):
