@@ -47,7 +47,7 @@ class Contacts:
     #: step; None: nowhere [m]
     moved: Floats | None = None
     linear: Floats | None = None  #: (nc,) the gaps from which gaps linear in the velocities start; None: `gap` [m]
-    #: (nc, 3) by how much the mean velocities along the surfaces in the step, of b relative to a, differ from those with
+    #: (nc, 3) by how much mean velocities along the surfaces in the step, of b relative to a, differ from those with
     #: these arms, as bodies turn; None: nothing [m/s]
     swing: Floats | None = None
     drift: Floats | None = None  #: (nc, 3) what the shear adds to the velocity of b relative to a; None: nothing [m/s]
