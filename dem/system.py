@@ -86,12 +86,13 @@ class ContactSystem:
     def __init__(
         self, world: World, contacts: Contacts, motion: UnconstrainedMotion, recovery_speed: float = np.inf,
         joints: Coupling | None = None, expected: Floats | None = None, push: Floats | None = None,
-        eased: tuple[Keys, Floats] | None = None,
+        eased: tuple[Keys, Floats] | None = None, smooth: bool = False,
     ) -> None:  # fmt: skip
         """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `joints`: those
         of this step, if contacts have shown them. `expected`:
         impulses (nc, 3) that the contacts are expected to have, as those of the last step; or `push` if it is known.
-        `eased`: contacts that bounce with a part of e alone, by key, from the method of that name."""
+        `eased`: contacts that bounce with a part of e alone, by key, from the method of that name; `smooth`: without
+        friction."""
         dt = motion.dt
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
@@ -148,8 +149,6 @@ class ContactSystem:
         self.surface = surface_velocities(world, contacts, self.frame)
         if self.surface is not None:
             self.b[:, 1:] = self.surface
-        if contacts.swing is not None:
-            self.b[:, 1:] += np.einsum("cij,cj->ci", self.frame[:, 1:], contacts.swing)
         self.take_flow(world, contacts)
         self.cell = cell_of(world, contacts, self.frame, dt)
         if self.cell is not None:
@@ -177,9 +176,15 @@ class ContactSystem:
         self._bounces, self._part = np.zeros(len(contacts), np.bool_), np.ones(len(contacts))
         if world.pairs.restitution.any():
             self._bounce(world, contacts, freely[:, 0], eased)
+        impacts = self._bounces
         if contacts.parting is not None:
             strikes = np.isfinite(contacts.parting)
             self.b[strikes, 0], self.compliance[strikes] = -contacts.parting[strikes], 0.0
+            impacts = impacts | strikes
+        if smooth:
+            self.mu = np.where(impacts, 0.0, self.mu)
+        if contacts.swing is not None:  # impacts last no step
+            self.b[:, 1:] += np.where(impacts[:, None], 0.0, np.einsum("cij,cj->ci", self.frame[:, 1:], contacts.swing))
         self.r = _beyond(self.b, freely, rounding)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0

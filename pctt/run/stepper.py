@@ -103,6 +103,7 @@ class Stepper:
     def _step(self) -> dict[str, Any]:
         self._corrections, self._shown, self._joints, self._push = 0, 0, None, None
         self._eased: tuple[Keys, Array] | None = None
+        self._smooth = False  # whether impacts of the present step are without friction
         with log.phase("search"):
             come_and_go(self.world)
             put_back(self.world)
@@ -137,10 +138,13 @@ class Stepper:
         problem, guess = self._assemble(contacts)
         result = self.solve(problem, guess)
         while True:
-            again = self._unseen(result.momentum)
-            if again is None and self._machines_are(result) and not self._gains(result):
-                return problem, guess, result
-            problem, guess = self._assemble(self.contacts if again is None else again, self._remembered(result))
+            if self._locks(result):
+                problem, guess = self._assemble(self.contacts)
+            else:
+                again = self._unseen(result.momentum)
+                if again is None and self._machines_are(result) and not self._gains(result):
+                    return problem, guess, result
+                problem, guess = self._assemble(self.contacts if again is None else again, self._remembered(result))
             result = self.solve(problem, guess).after(result)
 
     def _figures(self, contacts: int, result: ccp.Result, files: dict[str, Any]) -> dict[str, Any]:
@@ -178,7 +182,7 @@ class Stepper:
         or those found within this one."""
         self._release()
         given = self.motion, self.settings.recovery_speed, self._joints
-        within = self._push, self._eased
+        within = self._push, self._eased, self._smooth
         with log.phase("assembly"):
             place = contacts.key, contact_frames(contacts.normal)
             last, _ = self.memory.recall(*place, self._slabs is not self.world.slabs)
@@ -188,6 +192,13 @@ class Stepper:
             self.system.take_hold(last[: len(contacts)])
             self._problem = cone_problem(self.system, self.world.comm)
         return self._problem, guess
+
+    def _locks(self, result: ccp.Result) -> bool:
+        """Whether no impulses let bodies bounce as they are to, so that their impacts are to be without friction: in a
+        corner it may press a body on one wall as fast as the other sends it off."""
+        locked = result.status is ccp.Status.UNBOUNDED and not self._smooth
+        self._smooth = self._smooth or (locked and bool(self.world.pairs.restitution.any()))
+        return locked and self._smooth
 
     def _unseen(self, momentum: Array) -> Contacts | None:
         """The present contacts, with those that these momenta show to be missed; None if there are none. Three times a

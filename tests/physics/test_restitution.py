@@ -90,3 +90,18 @@ def test_a_rod_that_hits_a_rough_floor_gains_no_energy(angle, bounces):
         speed = (sim.velocities[:, :3] + np.cross(sim.local.velocity[:, 3:], tip))[0, 2]
     assert energy[-1] < energy[0]
     assert speed == pytest.approx(bounces * e, rel=0.05)
+
+
+@pytest.mark.parametrize("friction", [0.5, 1.0, 1.5])
+def test_a_ball_bounces_out_of_a_corner(friction):
+    """It meets both walls in one step. Their friction on it may lock it, and then has no part in the impact."""
+    radius = 0.01
+    scene = Scene(friction, (0, 0, 0), restitution=1.0)
+    scene.add_body("corner", [Plane((1, 0, 0)), Plane((0, 0, 1))])
+    scene.add_spheres([radius + 3e-4, 0, radius + 2e-4], radius, 1000.0, velocity=(-1.0, 0, -0.7))
+    with pctt.Simulation(scene, dt=1e-3) as sim:
+        mass = sim.world.grains.mass[0]
+        step = sim.step()
+        assert step["converged"]
+        assert 0.6 < step["kinetic_energy [J]"] / (0.5 * mass * 1.49) < 1.0
+        assert (sim.velocities[0, [0, 2]] > 0.6).all()
