@@ -7,6 +7,7 @@ Otherwise cross approximation compresses the matrix, which is not scaled, and it
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import log2, prod
 
 from mpi4py import MPI
@@ -23,7 +24,7 @@ from pctt.pc.mat import finds_negative, iterations_with_the_diagonal
 from pctt.pc.nystrom import Identity, Nystrom, choose
 from pctt.pc.options import Account, Options
 from pctt.pc.transforms import DifferencesInverse
-from pctt.tt.conjugate import Promise
+from pctt.tt.conjugate import NO_PROMISE, Promise
 from pctt.tt.cross import CROSS
 from pctt.tt.inverse import Inverse, invert_positive
 from pctt.tt.train import Array
@@ -34,7 +35,7 @@ class EntriesTrain:
     """`make` makes a preconditioner for a matrix, `times` multiplies with it.
 
     transform : the fast transform that is used; None if it is a train, or the diagonal
-    promise : what a trial has shown of the preconditioner in use, for `pctt.pc.watch`; None: it is not watched
+    promise : what a trial has shown of the preconditioner in use, for `pctt.pc.watch`; None: there is none
     compressed, inverse : trains of the present matrix and of its inverse; None before `make`, and without a train
     rank : cap of the ranks
     failure : why a train that was wanted is not used; empty if all is as asked
@@ -90,7 +91,7 @@ class EntriesTrain:
         refused = self._make_train(P, layout, options.setup_limit or limit)
         if refused:
             return self._take_no_train(A, P, layout, refused)
-        self.transform = self.promise = None
+        self.transform, self.promise = None, replace(NO_PROMISE, spent=self.promise.spent if self.promise else 0.0)
         return True
 
     def _choose_base(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout) -> float:
@@ -178,9 +179,7 @@ class EntriesTrain:
 
     def _invert(self, A: GridTrain, cap: int, eps: float, work: Work) -> Inverse | None:
         """The inverse of A / c; None if its train turns out not to be positive."""
-        found, work.spent = on_first(
-            self.comm, lambda: (invert_positive(A.train, cap, eps, work=work), work.spent)
-        )
+        found, work.spent = on_first(self.comm, lambda: (invert_positive(A.train, cap, eps, work=work), work.spent))
         return found
 
     def _is_negative(self, P: PETSc.Mat) -> bool:

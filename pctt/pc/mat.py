@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
@@ -9,6 +11,7 @@ from petsc4py import PETSc
 
 from pctt.blocks import block_csr_matrix, symmetric_shell
 from pctt.mat.entries import diagonal, given, has_entries
+from pctt.tt.conjugate import ConjugateGradients
 from pctt.tt.train import Array
 
 
@@ -73,6 +76,23 @@ def iterations_with_the_diagonal(A: PETSc.Mat, scale: Array, most: int = 500) ->
     D.destroy()
     found = float(np.log10(norms[0] / max(norms[-1], 1e-16 * norms[0])))
     return int(A.comm.tompi4py().bcast(min(most, probe * digits / max(found, probe * digits / most))))
+
+
+def conjugate_gradients(
+    A: PETSc.Mat, b: Array, solve: Callable[[Array], Array] | None = None, each: float = 0.0, x: Array | None = None
+) -> ConjugateGradients:  # fmt: skip
+    """The method for A, step by step, with this rank's parts of all vectors; the norms are the same on all ranks."""
+    comm, (vec, image) = A.comm.tompi4py(), A.createVecs()
+
+    def times(p: Array) -> Array:
+        vec.array_w[:] = p
+        A.mult(vec, image)
+        return image.array_r.copy()
+
+    def dot(p: Array, q: Array) -> float:
+        return float(comm.bcast(comm.allreduce(float(np.dot(p, q)))))
+
+    return ConjugateGradients(times, b, solve, each, dot, x)
 
 
 def null_vectors(A: PETSc.Mat, P: PETSc.Mat) -> list[Array]:

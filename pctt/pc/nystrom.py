@@ -8,9 +8,10 @@ Woodbury's, is right for noise that varies from point to point too. Each rank ha
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -19,13 +20,14 @@ from scipy import linalg
 
 from dem.exchange import on_first
 from pctt.mat.entries import Entries, diagonal, diagonal_blocks
-from pctt.tt.conjugate import Promise
+from pctt.pc.mat import conjugate_gradients
+from pctt.tt.conjugate import DIGITS, ConjugateGradients, Promise, iterations
 from pctt.tt.train import Array
 from pctt.tt.work import ENTRY, MULTIPLY
 
 BLOCK = 64  # columns that are drawn at a time
-PROBE = 12  # steps of a trial
-DIGITS = 8  # of the residual that a solution gains
+PROBE, LEAST, PART = 12, 3, 0.25  # steps of a trial, at most and at least, and the part of a solution that ends it
+MANY = 1e5  # iterations that are as bad as none
 EASY = 40  # a solution with fewer iterations needs nothing better
 OPENING, MOST = 0.08, 0.25  # parts of the operations of a solution, for the first columns and for as many again
 LARGEST = 1024  # rank
@@ -178,6 +180,13 @@ def _sum(comm: MPI.Comm, x: Array) -> Array:
     return out
 
 
+class Trial(NamedTuple):
+    """About how many iterations solutions to 1e-8 take, and what the trial has cost in products."""
+
+    iterations: list[float]
+    spent: float
+
+
 @dataclass(frozen=True)
 class Chosen:
     """A preconditioner, and what a trial has shown of it.
@@ -187,6 +196,7 @@ class Chosen:
     each : the cost of an application, that of a product with the matrix is 1
     iterations : of conjugate gradients to 1e-8, an estimate
     alone : of those without a preconditioner
+    spent : what all trials have cost, in products
     """
 
     inverse: Nystrom | None
@@ -194,6 +204,7 @@ class Chosen:
     each: float
     iterations: float
     alone: float
+    spent: float = 0.0
 
     @property
     def cost(self) -> float:
@@ -204,53 +215,52 @@ class Chosen:
     def promise(self) -> Promise | None:
         """What a solve may take; None if conjugate gradients have no preconditioner, or one that makes no difference.
 
-        The estimates may be too small by a factor of three.
+        Half of the estimate for none was at most what they took, in all kernels tried with a random right side.
         """
         if (self.inverse is None and not self.scaled) or self.iterations == self.alone:
             return None
-        return Promise.of_iterations(self.each, 3 * self.iterations, self.alone)
+        least = int(min(0.5 * self.alone, MANY))
+        return Promise(self.each, [1.0, 10 ** (-DIGITS / self.iterations)], [1.0] * (least + 1), self.spent)
 
 
-def trial(A: PETSc.Mat, solve: Callable[[Array], Array] | None, steps: int = PROBE) -> float:
-    """About how many iterations conjugate gradients for A take to 1e-8; the same on all ranks.
+def estimate(run: ConjugateGradients) -> float:
+    """About how many iterations to 1e-8 a run takes.
 
-    It is the smaller of two estimates from a few steps, both of which are mostly too large: by the norms of the
-    residuals, and by the spread of the eigenvalues of the tridiagonal matrix of the method (Golub & Van Loan, Matrix
-    Computations, 11.3). Infinite if A or the preconditioner is not positive.
+    The smaller of two estimates from its steps, both of which are mostly too large: by the norms of the residuals, and
+    by the spread of the eigenvalues of the tridiagonal matrix of the method (Golub & Van Loan, Matrix Computations,
+    11.3). Infinite if the matrix or the preconditioner is not positive.
     """
-    comm, (vec, image) = A.comm.tompi4py(), A.createVecs()
-    first, last = A.getOwnershipRange()
-    r = np.random.default_rng(0).standard_normal(A.getSize()[0])[first:last]
-
-    def dot(x: Array, y: Array) -> float:
-        return comm.bcast(comm.allreduce(float(x @ y)))
-
-    p, old, squares = np.zeros_like(r), np.inf, [dot(r, r)]
-    lengths: list[float] = []
-    growths: list[float] = []
-    for _ in range(steps):
-        z = r if solve is None else solve(r)
-        rz = dot(r, z)
-        growths.append(rz / old)
-        p = z + growths[-1] * p
-        vec.array_w[:] = p
-        A.mult(vec, image)
-        curvature = dot(p, image.array_r)
-        if not (rz > 0 and 0 < curvature < np.inf):
-            return np.inf
-        lengths.append(rz / curvature)
-        r, old = r - lengths[-1] * image.array_r, rz
-        squares.append(dot(r, r))
-        if squares[-1] <= 10.0 ** (-2 * DIGITS) * squares[0]:
-            return float(len(lengths))
-    steep, more = 1 / np.array(lengths), np.array(growths[1:])
+    steps = len(run.lengths)
+    if run.failed:
+        return np.inf
+    if run.norms[-1] <= 10.0**-DIGITS * run.norms[0]:
+        return float(steps)
+    steep, more = 1 / np.array(run.lengths), np.array(run.growths[1:])
     beside = np.diag(np.sqrt(more) * steep[:-1], 1)
     values = np.linalg.eigvalsh(np.diag(steep + np.append(0.0, more * steep[:-1])) + beside + beside.T)
     root = (values[-1] / max(values[0], 1e-16 * values[-1])) ** 0.5
     by_values = np.log(2 * 10.0**DIGITS) / np.log((root + 1) / max(root - 1, 1e-3))
-    gained = 0.5 * np.log10(squares[0] / min(squares))
-    by_norms = steps * DIGITS / gained if gained > 0 else np.inf
-    return float(comm.bcast(max(min(by_values, by_norms), steps)))
+    return float(max(min(by_values, iterations(run.norms)), steps))
+
+
+def trial(A: PETSc.Mat, solves: Sequence[Callable[[Array], Array] | None], each: float = 0.0) -> Trial:
+    """A few steps of conjugate gradients for A with each of these preconditioners, until they have cost a fourth of a
+    solution; collective.
+
+    each : the cost of an application of a preconditioner, that of a product is 1
+    """
+    first, last = A.getOwnershipRange()
+    b, comm = np.random.default_rng(0).standard_normal(A.getSize()[0])[first:last], A.comm.tompi4py()
+    runs = [conjugate_gradients(A, b, solve, 0.0 if solve is None else each) for solve in solves]
+    found: list[float] = []
+    for k in range(PROBE):
+        for run in runs:
+            run.step()
+        spent = sum(run.cost for run in runs)
+        found = comm.bcast([estimate(run) for run in runs])
+        if k >= LEAST - 1 and spent >= PART * min(found):
+            break
+    return Trial(found, spent)
 
 
 def block_jacobi(P: PETSc.Mat) -> Callable[[Array], Array] | None:
@@ -281,8 +291,8 @@ def choose(P: PETSc.Mat, A: PETSc.Mat, product: float) -> Chosen:
     product : operations of a product with A
     """
     jacobi = block_jacobi(P)
-    alone = trial(A, None)
-    scaled = alone if jacobi is None else trial(A, jacobi)
+    shown = trial(A, [None] if jacobi is None else [None, jacobi])
+    alone, scaled, spent = shown.iterations[0], shown.iterations[-1], shown.spent
     best = Chosen(None, scaled <= alone, 0.0, min(scaled, alone), alone)
     rows = P.getSize()[0]
     most = int(min(LARGEST, rows // 4, NUMBERS // rows))
@@ -296,9 +306,11 @@ def choose(P: PETSc.Mat, A: PETSc.Mat, product: float) -> Chosen:
         if not factor.grow(rank):
             break
         before, each = best.cost if known else np.inf, rows * rank / product
-        for D in factor.diagonals():
-            inverse = Nystrom(factor.comm, factor.F, D)
-            found = Chosen(inverse, False, each, trial(A, inverse), alone)
-            best = found if found.cost < best.cost else best
+        inverses = [Nystrom(factor.comm, factor.F, D) for D in factor.diagonals()]
+        shown = trial(A, inverses, each)
+        spent += shown.spent
+        for inverse, found in zip(inverses, shown.iterations):
+            new = Chosen(inverse, False, each, found, alone)
+            best = new if new.cost < best.cost else best
         known, rank = rank, min(2 * rank, most)
-    return best
+    return replace(best, spent=spent)

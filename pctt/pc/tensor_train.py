@@ -70,6 +70,7 @@ class TensorTrain(Context):
         self._points: np.ndarray | None = None
         self._last_precision: type = np.float64  # of the last solve
         self._watch: Watch | None = None  # of the solve that is going on
+        self._trials = 0.0  # products that the trials of the last set-up have cost, until a solve has counted them
         self._on_coordinates = on_coordinates(pc, self._take_points)
 
     def destroy(self, pc: PETSc.PC) -> None:
@@ -190,6 +191,7 @@ class TensorTrain(Context):
             reasons = [f"{made.failure}: {takes_over}", *[NOWHERE] * lost, *[FASTER] * sparse]
             self._warn(self.comm, "; ".join(reasons))
         self._refused = bool(made.failure)
+        self._trials = made.promise.spent if made.promise is not None else 0.0
         if self.rank == 1 and not self.failed:
             self._make_block_jacobi(P)
         set_failed(pc, self.failed)
@@ -259,7 +261,10 @@ class TensorTrain(Context):
             self._last_precision = self._precision(self._is_unharmed(ksp))
             self.made.use(self._last_precision)
         promise = None if self.P is None or self.failed else self.made.promise
-        self._watch = Watch(ksp, b, x, promise) if promise is not None and Watch.can(ksp, pc) else None
+        self._watch = None
+        if promise is not None and Watch.can(ksp, pc):
+            self._watch = Watch(ksp, b, x, promise, self._trials)
+            self._trials = 0.0
 
     @staticmethod
     def _is_unharmed(ksp: PETSc.KSP) -> bool:
@@ -306,8 +311,9 @@ class TensorTrain(Context):
     def _leave(self, watch: Watch, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Hand the solution of conjugate gradients alone to the KSP; other solves with this matrix then have no
         preconditioner."""
-        used, products = self._used(), watch.products
-        why = f"conjugate gradients alone take {products} iterations, {used} has not done in as many products"
+        used = self._used()
+        what = used if isinstance(used, str) else f"the train of rank {used}"
+        why = f"conjugate gradients alone take {watch.products} iterations, {what} has not done in as many products"
         assert isinstance(self.made, EntriesTrain)
         self.made.leave(why)
         self.rank = self.made.rank

@@ -1,37 +1,45 @@
-"""Watching a solve: conjugate gradients without a preconditioner in turns, once a preconditioner breaks its promise."""
+"""Watching a solve: conjugate gradients without a preconditioner in turns, once a preconditioner costs too much."""
 
 from __future__ import annotations
 
 from math import log10
 
-import numpy as np
 from petsc4py import PETSc
 
-from pctt.tt.conjugate import ConjugateGradients, Promise
+from pctt.pc.mat import conjugate_gradients
+from pctt.tt.conjugate import PATIENCE, ConjugateGradients, Promise, at_least, iterations
 from pctt.tt.train import Array
+
+AT_LEAST = 24.0  # products of trials and a solution that are too few to be watched
+PROBE = 6  # steps of conjugate gradients alone that show what they take for this right side
 
 
 class Watch:
     """A solve by a KSP. `count` is called before each application of the preconditioner.
 
-    Once the applications have cost as much as promised, conjugate gradients alone solve the same system in turns with
-    the KSP, each as many products as the other. If they have the solution first, the KSP ends with its next test, and
-    `solution` is theirs: all in all not more than twice what they take alone. Costs are counted, not measured, and all
-    ranks decide by the same norms.
+    Once trials and applications have cost as much as conjugate gradients alone are known to take, these solve the same
+    system in turns with the KSP, each as many products as the other. If they have the solution first, the KSP ends with
+    its next test, and `solution` is theirs: all in all not more than twice what they take alone, plus AT_LEAST. What
+    they are known to take is the least of what they took on a part of the matrix, and what their first steps with this
+    right side show; a preconditioner that has cost PATIENCE times what its trial has shown waits for neither. Costs are
+    counted, not measured, and all ranks decide by the same norms.
 
+    spent : what trials for this solve have cost, in products
     solution : this rank's part; None as long as the KSP goes on
     products : of conjugate gradients alone so far
     """
 
-    def __init__(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec, promise: Promise) -> None:
+    def __init__(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec, promise: Promise, spent: float) -> None:
         self.ksp, self.promise = ksp, promise
         self.solution: Array | None = None
         self._most = ksp.max_it
         self._b, self._start = b, x.array_r.copy() if ksp.getInitialGuessNonzero() else None
         norm = b.norm()
         self._enough = max(ksp.rtol * norm, ksp.atol)
-        digits = log10(norm / self._enough) if 0 < self._enough < norm else 16.0 if norm else 0.0
-        self._patience, self._spent = promise.patience(digits), 0.0
+        self._digits = log10(norm / self._enough) if 0 < self._enough < norm else 16.0 if norm else 0.0
+        cost, alone = promise.cost(self._digits), at_least(promise.alone, self._digits)
+        self._spent, self._expected = spent, max(AT_LEAST, min(spent + cost, alone))
+        self._patience = max(AT_LEAST, min(PATIENCE * cost, alone))
         self._alone: ConjugateGradients | None = None
 
     @staticmethod
@@ -46,33 +54,25 @@ class Watch:
     def count(self) -> None:
         """Collective."""
         self._spent += 1 + self.promise.each
-        if self._spent <= self._patience or self.solution is not None:
+        if self._spent <= self._expected or self.solution is not None:
             return
-        run = self._alone = self._alone or self._begin()
-        while run.cost < self._spent and run.norms[-1] > self._enough and not run.failed:
-            run.step()
-        if run.norms[-1] <= self._enough:
-            self.solution = run.x
+        if self._alone is None:
+            self._alone = conjugate_gradients(self.ksp.getOperators()[0], self._b.array_r, x=self._start)
+            self._go_on(PROBE)
+            self._patience = min(self._patience, iterations(self._alone.norms, self._digits))
+        if self._spent > self._patience:
+            self._go_on(self._spent)
+        if self._alone.norms[-1] <= self._enough:
+            self.solution = self._alone.x
             self.ksp.max_it = 1
 
-    def _begin(self) -> ConjugateGradients:
-        A = self.ksp.getOperators()[0]
-        comm = A.comm.tompi4py()
-        self._vecs = A.createVecs()
-
-        def times(x: Array) -> Array:
-            self._vecs[0].array_w[:] = x
-            A.mult(*self._vecs)
-            return self._vecs[1].array_r.copy()
-
-        def dot(x: Array, y: Array) -> float:
-            return comm.allreduce(float(np.dot(x, y)))
-
-        return ConjugateGradients(times, self._b.array_r, dot=dot, x=self._start)
+    def _go_on(self, products: float) -> None:
+        """With conjugate gradients alone, until they have cost so many products."""
+        run = self._alone
+        assert run is not None
+        while run.cost < products and run.norms[-1] > self._enough and not run.failed:
+            run.step()
 
     def end(self) -> None:
-        """Give the KSP its limit of iterations back; collective."""
+        """Give the KSP its limit of iterations back."""
         self.ksp.max_it = self._most
-        if self._alone:
-            for vec in self._vecs:
-                vec.destroy()

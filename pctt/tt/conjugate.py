@@ -12,8 +12,7 @@ from pctt.tt.train import Array
 
 Product = Callable[[Array], Array]
 DIGITS = 8.0  # of the residual, that a solution gains
-AT_LEAST = 24.0  # products of a solution that are too few to be watched
-PATIENCE = 3.0  # what a preconditioner may cost, in costs that its trial has shown
+PATIENCE = 4.0  # what a preconditioner may cost, in costs that its trial has shown
 
 
 class ConjugateGradients:
@@ -27,6 +26,7 @@ class ConjugateGradients:
 
     x : the solution so far
     norms : of the residuals, one more than there were steps
+    lengths, growths : of the steps, and of the squares of the residuals in the form of the preconditioner
     failed : whether the matrix or the preconditioner is not positive
 
     >>> run = ConjugateGradients(lambda x: 2 * x, np.ones(3))
@@ -44,6 +44,8 @@ class ConjugateGradients:
         self._r = b.copy() if x is None else b - times(x)
         self._p, self._rz = np.zeros_like(b), inf
         self.norms = [self._norm()]
+        self.lengths: list[float] = []
+        self.growths: list[float] = []
         self.failed = False
 
     def _norm(self) -> float:
@@ -67,6 +69,8 @@ class ConjugateGradients:
             self.failed = True
             return
         step = self._rz / curvature
+        self.lengths.append(step)
+        self.growths.append(self._rz / old)
         self.x += step * self._p
         self._r = self._r - step * q
         self.norms.append(self._norm())
@@ -78,44 +82,52 @@ def iterations(norms: Sequence[float], digits: float = DIGITS) -> float:
     >>> iterations([1.0, 0.1, 0.001], 2), iterations([1.0, 0.1, 0.01], 4)
     (2.0, 4.0)
     """
+    found = at_least(norms, digits)
+    gained = log10(norms[0] / min(norms)) if min(norms) > 0 else inf
+    if gained >= digits:
+        return float(found)
+    return found * digits / gained if gained > 0 else inf
+
+
+def at_least(norms: Sequence[float], digits: float = DIGITS) -> int:
+    """The number of iterations that gain these digits; where the norms (k + 1,) have not gained them, k.
+
+    >>> at_least([1.0, 0.1, 0.001], 2), at_least([1.0, 0.1, 0.01], 4)
+    (2, 2)
+    """
     enough = norms[0] * 10.0**-digits
-    for k, norm in enumerate(norms):
-        if norm <= enough:
-            return float(k)
-    gained = _gained(norms)
-    return (len(norms) - 1) * digits / gained if gained > 0 else inf
-
-
-def _gained(norms: Sequence[float]) -> float:
-    """Digits; the norms are not zero."""
-    return log10(norms[0] / min(norms))
+    return next((k for k, norm in enumerate(norms) if norm <= enough), len(norms) - 1)
 
 
 def race(runs: Sequence[ConjugateGradients], slack: float, most: float, digits: float = DIGITS) -> list[float]:
-    """What each run has cost when it had gained these digits; infinite for those that have lost.
+    """About what each run costs until it has gained these digits; infinite for those that fail.
 
-    The cheapest so far makes the next step. The race ends when all others have cost `slack` times as much as the
-    winner, or `most`. If nobody has gained the digits then, the costs are extrapolated. (Who lags behind at first may
+    The cheapest so far makes the next step. With a preconditioner a run ends at half of the digits, and costs twice as
+    much; without one it gains most of them late, so it goes on. The race ends when all others cost `slack` times as
+    much as the winner, or `most`. What those that have not arrived cost is extrapolated. (Who lags behind at first may
     win, so nobody is sent home early.)
     """
-    found = [inf] * len(runs)
+    halves = [1.0 if run.solve is None else 0.5 for run in runs]
+
+    def gone(k: int) -> float:
+        return runs[k].cost / halves[k]
+
     running = list(range(len(runs)))
     while running:
-        k = min(running, key=lambda k: runs[k].cost)
+        k = min(running, key=gone)
         run = runs[k]
-        if run.cost >= most:
+        if gone(k) >= most:
             break
         run.step()
         if run.failed:
             running.remove(k)
-        elif run.norms[-1] <= run.norms[0] * 10.0**-digits:
+        elif run.norms[-1] <= run.norms[0] * 10.0 ** (-digits * halves[k]):
             running.remove(k)
-            found[k] = run.cost
-            most = min(most, slack * run.cost)
-    if min(found) == inf:
-        for k in running:
-            found[k] = iterations(runs[k].norms, digits) * (1 + runs[k].each)
-    return found
+            most = min(most, slack * gone(k))
+    return [
+        inf if run.failed else iterations(run.norms, half * digits) / half * (1 + run.each)
+        for run, half in zip(runs, halves)
+    ]
 
 
 @dataclass(frozen=True)
@@ -124,28 +136,25 @@ class Promise:
 
     each : the cost of an application, that of a product with the matrix is 1
     norms : of the residuals of conjugate gradients with it
-    alone : of those without a preconditioner
+    alone : of those without a preconditioner, as far as they were tried, on a part of the matrix. Its eigenvalues lie
+        between those of the whole, so the whole takes as many iterations at least
+    spent : what the trials have cost, in products with the matrix
     """
 
     each: float
     norms: Sequence[float]
     alone: Sequence[float]
-
-    @classmethod
-    def of_iterations(cls, each: float, found: float, alone: float) -> Promise:
-        """From these numbers of iterations that gain eight digits, all as much."""
-        return cls(each, [1.0, 10 ** (-DIGITS / found)], [1.0, 10 ** (-DIGITS / alone)])
+    spent: float = 0.0
 
     @property
     def iterations(self) -> int:
         """That gain eight digits."""
         return int(min(iterations(self.norms), 1e9))
 
-    def patience(self, digits: float) -> float:
-        """The products that a solution to these digits may cost before conjugate gradients alone are tried beside.
+    def cost(self, digits: float) -> float:
+        """Of a solution to these digits with the preconditioner, in products."""
+        return (1 + self.each) * iterations(self.norms, digits)
 
-        The matrix of the trial may be a principal submatrix. Then the eigenvalues of the whole are spread more widely,
-        so without a preconditioner the whole takes as many iterations at least.
-        """
-        promised = PATIENCE * (1 + self.each) * iterations(self.norms, digits)
-        return max(AT_LEAST, min(promised, iterations(self.alone, digits)))
+
+#: Nothing is known of a preconditioner.
+NO_PROMISE = Promise(0.0, [1.0, 0.0], [1.0])

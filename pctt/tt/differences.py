@@ -15,7 +15,7 @@ sign. So errors at the boundary have opposite signs, and a mean of both inverses
 only the mean of a over the signs of the coordinates. If A differs much from it (rotated anisotropy), circulants are
 better, and so is a part of the inverse of the circulant on a grid twice as wide that has A as a part.
 
-Which of them is best, if any, a few solutions on parts of the grid show (`choose`).
+Which of them is best, if any, solutions on small parts of the grid show (`choose`).
 """
 
 from __future__ import annotations
@@ -28,14 +28,17 @@ from math import inf, prod
 import numpy as np
 from scipy import fft
 
-from pctt.tt.conjugate import DIGITS, PATIENCE, ConjugateGradients, Promise, iterations, race
+from pctt.tt.conjugate import DIGITS, PATIENCE, ConjugateGradients, Promise, at_least, race
 from pctt.tt.train import Array
 
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
-POINTS = 4096  # most points of a part of the grid, on which solutions are tried; with 1024 two of 26 choices were bad
-SLACK = 1.5  # a preconditioner that costs so many times more than another one on a part is not tried further
-MOST = 400.0  # products that a trial may cost
-FINAL = 1.5  # digits that a trial on the whole grid gains, where parts of it need no preconditioner
+#: Shares of the points of a grid, and the most points, on which solutions are tried: all, then the best of them.
+SHARES = ((1 / 100, 1024), (1 / 40, 4096))
+LEAST, ROWS = 64, 3  # points; rows of points of a periodic axis
+NEARLY = 0.05  # a periodic function may change so much in a period
+FINALISTS, FAR = 4, 2.5  # number of those, and what they may cost beside the best of them
+SLACK = 1.3  # a preconditioner that costs so many times more than another one on a part is not tried further
+MOST = 1000.0  # products that a trial may cost
 
 #: What is tried: the transforms of which the mean of the inverses is taken, and their shares.
 Kind = tuple[tuple[str, float], ...]
@@ -107,13 +110,30 @@ class Differences:
         """a at all combinations of these differences along the axes."""
         return self.values[np.ix_(*[np.abs(s) if self.even else s for s in offsets])]
 
-    def part(self, counts: Sequence[int], strides: Sequence[int]) -> Differences:
-        """Those of so many points along each axis, with these distances."""
-        offsets = []
-        for count, stride in zip(counts, strides):
-            s = np.arange(count)
-            offsets.append(stride * (s if self.even else np.concatenate([s, s[1:] - count])))
-        return Differences(tuple(counts), self.at(offsets))
+    def part(self, counts: Sequence[int]) -> Differences:
+        """Those of so many neighbouring points along each axis."""
+        return Differences(tuple(counts), self.at([self._signed(count) for count in counts]))
+
+    def means_of(self, counts: Sequence[int], widths: Sequence[int]) -> Differences:
+        """Those of P A P', where the orthonormal rows of P are the means over cells of so many points, times a root.
+
+        counts, widths : along each axis, of cells and of points of a cell
+
+        >>> Differences.of_even(np.array([2.0, 1.0, 0.0, 0.0])).means_of([2], [2]).values.ravel()
+        array([3. , 0.5])
+        """
+        values = self.values
+        for axis, (count, width) in enumerate(zip(counts, widths)):
+            first = width * self._signed(count)
+            offsets = [np.abs(first + t) if self.even else first + t for t in range(1 - width, width)]
+            weights = 1 - np.abs(np.arange(1 - width, width)) / width
+            values = np.sum([w * np.take(values, s, axis) for w, s in zip(weights, offsets)], axis=0)
+        return Differences(tuple(counts), values)
+
+    def _signed(self, count: int) -> Array:
+        """The differences of so many points on an axis, in the order of `values`."""
+        s = np.arange(count)
+        return s if self.even else np.concatenate([s, s[1:] - count])
 
     def _along(self, axis: int, values: Array) -> tuple[Array, Array, Array]:
         """a(s) and a(s - n) for s = 0, ..., n - 1 along an axis, which comes first, and s / n of the same dimension.
@@ -134,12 +154,15 @@ class Differences:
         return values
 
     @property
-    def periodic(self) -> list[bool]:
-        """For each axis, whether a(s) = a(s - n) up to rounding. If all axes are periodic, A is a circulant."""
-        enough, found = 1e-12 * np.abs(self.values).max(), []
+    def aperiodic(self) -> list[float]:
+        """For each axis, how far a(s) is from a(s - n), relative to the largest a(s), s not 0. If all are zero, A is a
+        circulant."""
+        sizes = np.abs(self.values)
+        sizes[(0,) * len(self.shape)] = 0.0
+        largest, found = sizes.max() or 1.0, []
         for axis in range(len(self.shape)):
             here, back, _ = self._along(axis, self.values)
-            found.append(bool(np.abs(here - back)[1:].max(initial=0.0) <= enough))
+            found.append(float(np.abs(here - back)[1:].max(initial=0.0) / largest))
         return found
 
     def means(self) -> Array:
@@ -297,90 +320,104 @@ class Choice:
     promise: Promise
 
 
-def parts(shape: tuple[int, ...], periodic: Sequence[bool]) -> list[tuple[list[int], list[int]]]:
-    """Numbers of points and their distances of parts of a grid with at most POINTS points: the whole grid, or
-    neighbouring points and points that are spread over the grid. Periodic axes stay whole, if they are short enough.
+def parts(a: Differences, share: float) -> list[Differences]:
+    """Matrices of this share of the points that have their eigenvalues between those of A: of neighbouring points, and
+    of the means of cells of points (times the root of their number).
+
+    The first shows how a behaves near zero, the second how it does far from it, on the whole grid. Periodic axes stay
+    whole, if they are short enough. A small grid is no smaller part.
     """
-    if prod(shape) <= POINTS:
-        return [(list(shape), [1] * len(shape))]
-    whole = prod(n for n, around in zip(shape, periodic) if around)
-    if whole > POINTS / 16:
-        whole, periodic = 1, [False] * len(shape)
-    side = max(1, int((POINTS / whole) ** (1 / (len(shape) - sum(periodic))) + 1e-9))
-    sides = [n if around else side for n, around in zip(shape, periodic)]
-    strides = []
+    shape, size = a.shape, prod(a.shape)
+    whole = [far <= NEARLY and ROWS * n <= size / 8 for n, far in zip(shape, a.aperiodic)]
+    if all(whole):
+        whole = [False] * len(shape)
+    rows = ROWS * prod(n for n, all_ in zip(shape, whole) if all_) if any(whole) else 0
+    points = max(size * share, LEAST, rows)
+    if size <= points:
+        return [a]
+    sides, left, axes = list(shape), points / prod(n for n, all_ in zip(shape, whole) if all_), len(shape) - sum(whole)
+    for k in sorted(range(len(shape)), key=lambda k: shape[k]):
+        if not whole[k]:
+            sides[k] = max(1, min(shape[k], round(left ** (1 / axes))))
+            left, axes = max(1.0, left / sides[k]), axes - 1
+    widths = []
     for n, side in zip(shape, sides):
-        least = -(-n // side)  # a divisor keeps what is periodic
-        strides.append(next((k for k in range(least, 2 * least) if n % k == 0), least))
-    spread = [-(-n // stride) for n, stride in zip(shape, strides)]
-    return [([min(n, side) for n, side in zip(shape, sides)], [1] * len(shape)), (spread, strides)]
+        most = n // side  # a divisor shows all of the grid
+        widths.append(next((k for k in range(most, most // 2, -1) if n % k == 0), most))
+    return [a.part(sides), a.means_of([n // width for n, width in zip(shape, widths)], widths)]
 
 
 def choose(a: Differences) -> Choice | None:
-    """The preconditioner with which conjugate gradients cost least; None if a part of A is not positive definite.
+    """The preconditioner with which conjugate gradients cost least; None if A is not positive definite.
 
-    Parts of the grid are principal submatrices of A: neighbouring points show how a behaves near zero, points that are
-    spread over the grid how it does far from it. If no preconditioner is good on both, those that win on one of them
-    have a trial on the whole grid; a short one, with the best of them, if both parts need none.
+    All are tried on small parts of the grid, the best of them on larger parts too. Costs that have grown count as if
+    they grew once more up to the whole.
     """
-    if all(a.periodic):  # which a part of the grid does not show
+    if max(a.aperiodic) <= 1e-12:  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
         return Choice(CIRCULANT, Promise(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
     kinds = [kind for kind in CANDIDATES if a.block > 1 or kind != BLOCK_DIAGONAL]
+    scores: dict[Kind, float] = {}
     trials: list[_Trial] = []
-    for counts, strides in parts(a.shape, a.periodic):
-        if trials:
-            kinds = [kind for kind in kinds if trials[0].costs[kind] < inf or kind in (NOTHING, CIRCULANT)]
-        trial = _trial(a.part(counts, strides), kinds)
-        if trial is None:
-            return None
-        trials.append(trial)
-    totals = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}  # the harder part counts
-    found = min(kinds, key=lambda kind: totals[kind])
-    finalists: list[Kind] = []
-    if totals[found] == inf:
-        finalists = list(dict.fromkeys(trial.winner for trial in trials))
-    elif found == NOTHING and len(trials) > 1:  # parts of I + h^d K are nearer to I than the whole
-        finalists = [NOTHING, min(set(kinds) - {NOTHING}, key=lambda kind: (totals[kind], kinds.index(kind)))]
-    if finalists:
-        whole = _trial(a, finalists, DIGITS if totals[found] == inf else FINAL)
-        if whole is None:
-            return None
-        found = whole.winner
-        trials = [*trials, whole]
-    norms, alone = (
-        max((trial.runs[kind].norms for trial in trials if kind in trial.runs), key=iterations)
-        for kind in (found, NOTHING)
-    )
-    return Choice(found, Promise(trials[-1].runs[found].each, norms, alone))
+    spent = 0.0
+    for share, most in SHARES:
+        pieces = parts(a, min(share, most / prod(a.shape)))
+        if scores and pieces[0].shape == trials[0].shape:
+            break
+        trials = []
+        for part in pieces:
+            trial = _Trial.of(part, kinds)
+            if trial is None:
+                return None
+            trials.append(trial)
+        costs = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}  # the harder part counts
+        scores = {kind: cost * max(1.0, cost / scores.get(kind, cost)) for kind, cost in costs.items()}
+        best = sorted(kinds, key=lambda kind: scores[kind])[:FINALISTS]
+        kinds = [kind for kind in kinds if kind == NOTHING or kind in best and scores[kind] <= FAR * scores[best[0]]]
+        spent += sum(trial.spent for trial in trials)
+        if len(kinds) == 1:
+            break
+    found = min(kinds, key=lambda kind: scores[kind])
+    hard = max(trials, key=lambda trial: trial.costs[found])
+    spent -= sum(trial.spent for trial in trials)
+    alone = max((trial.alone(hard.costs[found]) for trial in trials), key=at_least)
+    spent += sum(trial.spent for trial in trials)
+    return Choice(found, Promise(hard.runs[found].each, hard.runs[found].norms, alone, spent / prod(a.shape)))
 
 
 class _Trial:
-    """Solutions with a matrix by conjugate gradients with preconditioners, with a random right side."""
+    """Solutions with a matrix by conjugate gradients with preconditioners, with a random right side.
 
-    def __init__(self, a: Differences, inverses: dict[Kind, FastInverse], digits: float) -> None:
-        times = a.times
-        b = np.random.default_rng(0).standard_normal(prod(a.shape) * a.block)
+    costs : of solutions, in products
+    spent : by the trial, in products times points
+    """
+
+    def __init__(self, a: Differences, inverses: dict[Kind, FastInverse]) -> None:
+        times, self.shape, points = a.times, a.shape, prod(a.shape)
+        b = np.random.default_rng(0).standard_normal(points * a.block)
         solves = {kind: inverse.solve if kind else None for kind, inverse in inverses.items()}
         self.runs = {kind: ConjugateGradients(times, b, solves[kind], inverses[kind].each) for kind in inverses}
-        costs = race(list(self.runs.values()), SLACK, MOST, digits)
-        if digits < DIGITS:  # a few iterations: what each of them gains tells more than their number
-            costs = [inf if run.failed else iterations(run.norms) * (1 + run.each) for run in self.runs.values()]
-        self.costs = dict(zip(self.runs, costs))
-        self.winner = min(self.costs, key=lambda kind: self.costs[kind])
-        alone, enough = self.runs.get(NOTHING), 10.0**-digits * float(np.linalg.norm(b))
-        most = PATIENCE * min(costs) if digits == DIGITS else 0.0
-        while alone and not alone.failed and alone.norms[-1] > enough and alone.cost < most:
+        self.costs = dict(zip(self.runs, race(list(self.runs.values()), SLACK, MOST)))
+
+    @classmethod
+    def of(cls, a: Differences, kinds: Sequence[Kind]) -> _Trial | None:
+        """None if A is not positive definite."""
+        inverses = {kind: FastInverse(a, kind) for kind in kinds}
+        if not all(inverse.positive for inverse in inverses.values()):
+            return None
+        trial = cls(a, inverses)
+        return trial if min(trial.costs.values()) < inf else None
+
+    @property
+    def spent(self) -> float:
+        return prod(self.shape) * sum(run.cost for run in self.runs.values())
+
+    def alone(self, cost: float) -> Sequence[float]:
+        """The norms without a preconditioner, until they have cost PATIENCE times as much as this."""
+        alone, most = self.runs[NOTHING], PATIENCE * cost
+        while not alone.failed and alone.norms[-1] > alone.norms[0] * 10.0**-DIGITS and alone.cost < most:
             alone.step()
-
-
-def _trial(a: Differences, kinds: Sequence[Kind], digits: float = DIGITS) -> _Trial | None:
-    """None if A is not positive definite."""
-    inverses = {kind: FastInverse(a, kind) for kind in kinds}
-    if not all(inverse.positive for inverse in inverses.values()):
-        return None
-    trial = _Trial(a, inverses, digits)
-    return None if all(run.failed for run in trial.runs.values()) else trial
+        return alone.norms
 
 
 # -- the differences of entries ------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """19 dense matrices with exact products by FFT, 26 others of this kind, and harder ones without: CG to 1e-8 with
 `pctt.pc.TensorTrain` by its defaults (auto) and as a train of rank 100 at most (train), and with its rivals: run/study
-kernels [-only NAME...] [-ways WAY...] [-quick]. Writes results/kernels.json.
+kernels [-only NAME...] [-ways WAY...] [-quick] [-products]. Writes results/kernels.json, or with -products a table of
+products: trials and solution of auto beside CG alone and a circulant.
 
 Entries of the 19 depend on differences, so that products by FFT are exact. The unit of length is the side of the
 domain, in one dimension the spacing. Every solution is a process of its own; CPU seconds of one thread. Rivals: CG
@@ -29,6 +30,7 @@ from petsc4py import PETSc
 from shared import Row, lines_of, parser, record, say_machine
 
 from pctt.tt import differences
+from pctt.tt.conjugate import ConjugateGradients
 
 Array = np.ndarray
 Product = Callable[[Array], Array]
@@ -220,6 +222,24 @@ def others() -> dict[str, Callable[[], Problem]]:
     }  # fmt: skip
 
 
+def more() -> dict[str, Callable[[], Problem]]:
+    """Ten that are turned, moving, periodic with noise, on lines, in a box; and of sizes that are no powers of two."""
+    season = lambda t, period: np.exp(-2 * np.sin(np.pi * t / period) ** 2)  # noqa: E731
+    matern3 = lambda d: (1 + 3**0.5 * d) * np.exp(-(3**0.5) * d)  # noqa: E731
+    return {
+        "exp_15": lambda: signed((120, 90), lambda x, y: np.exp(-turned(x, y, 0.26, 25, 5)), 0.01),
+        "matern3_45": lambda: signed((100, 100), lambda x, y: matern3(turned(x, y, 0.785, 15, 3)), 0.05),
+        "matern5_75": lambda: signed((144, 96), lambda x, y: matern5(turned(x, y, 1.31, 10, 2)), 0.001),
+        "moving_fast": lambda: signed((80, 125), lambda x, t: np.exp(-np.hypot((x - 1.7 * t) / 8, t / 10)), 0.02),
+        "moving_gauss": lambda: signed((90, 84), lambda x, t: np.exp(-(((x + 0.4 * t) / 5) ** 2) - (t / 9) ** 2), 0.05),
+        "line_matern3": lambda: signed((5000,), lambda x: matern3(np.abs(x) / 40), 0.01),
+        "line_season": lambda: signed((3600,), lambda x: np.exp(-np.abs(x) / 300) * season(x, 24), 0.1),
+        "periodic": lambda: signed((120, 135), lambda x, y: np.exp(-((around(x, 120) / 9) ** 2) - np.abs(y) / 6), 0.05),
+        "matern5_noisy": lambda: signed((100, 81), lambda x, y: matern5(np.hypot(x, y) / 3), 1.0),
+        "exp_box": lambda: signed((30, 25, 20), lambda x, y, z: np.exp(-np.hypot(turned(x, y, 0, 12, 4), z / 2)), 0.02),
+    }  # fmt: skip
+
+
 def weighted(n: int, weight: Callable[[Array, Array], Array]) -> Problem:
     """I + a K a with K = 100 h^2 exp(-10 r) and a weight a(x, y) of the points of the square."""
     kernel = radial((n, n), lambda r, h: 100 * h**2 * np.exp(-10 * r))
@@ -350,7 +370,7 @@ def solve(way: str, problem: Problem) -> Row:
 
 def child(name: str, way: str) -> None:
     """One solution, as a line of JSON."""
-    problem = {**nineteen(), **others(), **hard()}[name]()
+    problem = {**nineteen(), **others(), **more(), **hard()}[name]()
     row = solve(way, problem)
     for _ in range(REPEAT - 1 if row["setup_s"] + row["solve_s"] < SHORT else 0):
         again = solve(way, problem)
@@ -380,9 +400,52 @@ def text(row: Row) -> str:
     return f"{row['setup_s']:.2f} + {row['solve_s']:.2f} ({row['iterations']}){good}"
 
 
+class Counted(ConjugateGradients):
+    """Counts products and applications, times the unknowns."""
+
+    spent = 0.0
+
+    def step(self) -> None:
+        before = len(self.norms)
+        super().step()
+        Counted.spent += (len(self.norms) - before) * (1 if self.solve is None else 2) * len(self.x)
+
+
+def products(names: list[str]) -> None:
+    """A table: iterations of CG alone and with a circulant, and trials and iterations of auto, in products with the
+    matrix. An application of a preconditioner counts as one, a product with a part of the matrix as this part."""
+    problems = {**nineteen(), **others(), **more()}
+    vars(differences)["ConjugateGradients"] = Counted
+
+    def iterations(a: differences.Differences, kind: differences.Kind) -> int:
+        inverse, b = differences.FastInverse(a, kind), np.random.default_rng(1).standard_normal(prod(a.shape))
+        run = ConjugateGradients(a.times, b, inverse.solve if kind else None)
+        while run.norms[-1] > RTOL * run.norms[0] and len(run.norms) <= MOST_ITS and not run.failed:
+            run.step()
+        return len(run.norms) - 1
+
+    print("| kernel | CG alone | circulant | trials | auto | in all, of the better | auto took |")
+    print("|---|---|---|---|---|---|---|")
+    for name in names:
+        a = problems[name]().a
+        assert a is not None
+        Counted.spent = 0.0
+        choice = differences.choose(a)
+        assert choice is not None
+        trials = Counted.spent / prod(a.shape)
+        kinds = differences.NOTHING, differences.CIRCULANT, choice.kind
+        alone, circulant, auto = (iterations(a, kind) for kind in kinds)
+        ratio = (trials + auto * (2 if choice.kind else 1)) / min(alone, 2 * circulant)
+        took = differences.FastInverse(a, choice.kind).name
+        print(f"| {name} | {alone} | {circulant} | {trials:.1f} | {auto} | {ratio:.2f} | {took} |", flush=True)
+
+
 def main(given: argparse.Namespace) -> None:
+    if given.products:
+        products(given.only or list({**nineteen(), **others(), **more()}))
+        return
     about = say_machine()
-    names = {**nineteen(), **others(), **hard()}
+    names = {**nineteen(), **others(), **more(), **hard()}
     chosen = given.only or (QUICK if given.quick else list(names))
     rows: list[Row] = []
     for name in chosen:
@@ -399,7 +462,7 @@ def main(given: argparse.Namespace) -> None:
                 row = found[way]
                 warned = f"; WARNED: {row['warned']}" if row["warned"] else ""
                 print(f"    {way}: {row['what']}, true residual {row['residual']:.1e}{warned}", flush=True)
-    sets = (("with an FFT", nineteen()), ("others with an FFT", others()), ("hard", hard()))
+    sets = (("with an FFT", nineteen()), ("others with an FFT", {**others(), **more()}), ("hard", hard()))
     totals = [score([row for row in rows if row["name"] in names], words) for words, names in sets]
     record("kernels", about, rows + [score_ for score_ in totals if score_])
 
@@ -443,8 +506,9 @@ def iterations_beyond(rows: list[Row]) -> dict[str, float]:
 
 if __name__ == "__main__":
     words = parser("kernels", __doc__)
-    words.add_argument("-only", nargs="+", choices=[*nineteen(), *others(), *hard()], help="problems")
+    words.add_argument("-only", nargs="+", choices=[*nineteen(), *others(), *more(), *hard()], help="problems")
     words.add_argument("-ways", nargs="+", choices=WAYS, default=WAYS, help="ways to solve them")
+    words.add_argument("-products", action="store_true", help="a table of products")
     words.add_argument("-quick", action="store_true", help="five problems")
     words.add_argument("-child", nargs=2, help=argparse.SUPPRESS)
     asked = words.parse_args()

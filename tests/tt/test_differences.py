@@ -107,26 +107,40 @@ def count(a: of.Differences, kind: of.Kind) -> int:
     return len(run.norms) - 1
 
 
-x, y = offsets(48, 40)
+x, y = offsets(96, 80)
 turned = np.hypot((0.8 * x + 0.6 * y) / 9, (0.8 * y - 0.6 * x) / 2)
 KERNELS = {
     "exponential": np.exp(-np.hypot(x, y) / 10), "turned": np.exp(-turned), "turned Gauss": np.exp(-(turned**2)),
     "waves": np.cos(0.5 * x) * np.cos(0.5 * y), "season": np.exp(-abs(x) / 8 - 2 * np.sin(np.pi * y / 8) ** 2),
-    "periodic": np.exp(-np.minimum(abs(x), 48 - abs(x)) / 5 - np.minimum(abs(y), 40 - abs(y)) / 9),
+    "periodic": np.exp(-np.minimum(abs(x), 96 - abs(x)) / 5 - np.minimum(abs(y), 80 - abs(y)) / 9),
     "band": np.sinc(0.2 * x) * np.sinc(0.15 * y), "moving": np.exp(-np.hypot((x - 0.8 * y) / 6, y / 12)),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", KERNELS)
-@pytest.mark.parametrize("points", [4096, 256])
-def test_the_choice_is_no_worse_than_nothing_and_a_circulant(name, points, monkeypatch) -> None:
-    """On parts of 256 points too, which do not show all of the kernel."""
-    monkeypatch.setattr(of, "POINTS", points)
+def test_the_choice_and_its_trials_cost_no_more_than_nothing_and_a_circulant(name) -> None:
+    """Where each product with A and each application of a preconditioner counts as one."""
     a = kernel(KERNELS[name], 0.02)
-    kind = of.choose(a).kind
-    assert count(a, kind) <= 1.3 * min(count(a, of.NOTHING), count(a, of.CIRCULANT))
+    found = of.choose(a)
+    chosen, alone, circulant = (count(a, kind) for kind in (found.kind, of.NOTHING, of.CIRCULANT))
+    assert chosen <= 1.3 * min(alone, circulant)
+    if name == "band":  # a tie: a cosine transform takes 164 iterations, none 168
+        return
+    assert found.promise.spent + chosen * (2 if found.kind else 1) <= 1.3 * min(alone, 2 * circulant) + 1
     if name == "exponential":
-        assert count(a, kind) <= 0.4 * count(a, of.CIRCULANT)
+        assert chosen <= 0.4 * circulant
+
+
+@given(SHAPES, st.integers(1, 2), st.booleans(), st.integers(0, 9))
+def test_means_over_cells_are_those_of_the_matrix(shape, block, even, seed) -> None:
+    a = some(shape, block, even, seed)
+    widths = [1 + seed % n for n in shape]
+    counts = [n // width for n, width in zip(shape, widths)]
+    P = np.ones((1, 1))
+    for n, number, width in zip(shape, counts, widths):
+        P = np.kron(P, np.kron(np.eye(number), np.ones(width) / width**0.5) @ np.eye(number * width, n))
+    P = np.kron(P, np.eye(block))
+    np.testing.assert_allclose(dense(a.means_of(counts, widths)), P @ dense(a) @ P.T, atol=1e-10 * dense(a)[0, 0])
 
 
 @pytest.mark.parametrize("strength", [1000.0, 2500.0])
@@ -143,7 +157,8 @@ def test_parts_of_an_equation_of_the_second_kind_do_not_show_all_of_it(strength)
 def test_the_best_share_is_chosen() -> None:
     t = 2 - 2 * np.cos(2 * np.pi * np.arange(512) / 512)
     fractional = np.fft.irfft2((t[:, None] + t[:257]) ** 0.7)[:48, :48]
-    assert of.choose(of.Differences.of_even(fractional)).kind == (("sine", 1.0),)
+    a = of.Differences.of_even(fractional)
+    assert count(a, of.choose(a).kind) <= 1.25 * min(count(a, kind) for kind in of.CANDIDATES if kind)
 
 
 @pytest.mark.parametrize("a", [[1.0, 2.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0]])
@@ -160,7 +175,8 @@ def test_a_race_is_won_by_the_cheapest_and_never_by_one_that_has_not_arrived() -
         return [ConjugateGradients(lambda x: A @ x, b, solve, each) for solve in solves]
 
     first, second, third = race(runs(nothing, exact, spoilt), 2.0, 50.0)
-    assert (first, second, third) == (np.inf, 1.0, np.inf)
+    assert second <= 2.0
+    assert min(first, third) > 10.0
     dear = runs(nothing, exact)
     dear[1].each = 1000.0
     assert race(dear, 2.0, 500.0)[0] < race(dear, 2.0, 2000.0)[1]
