@@ -1,0 +1,277 @@
+"""Speed is tested by counts, which do not depend on the clock: none may grow by more than 15 %.
+
+Problems are of fixed seeds. Counts are sums over several of them, as last bits change one of them a little. Who makes
+the methods better puts the new numbers into the table.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from petsc4py import PETSc
+from problems import SELF, from_graph, heap
+from train_solver import context, poisson, ready, solve
+
+import pctt
+from dem.compiled import Loop
+from dem.contact_map import Halo
+from dem.scene import Scene
+from dem.shapes import Plane
+from pctt import ccp, tt
+from pctt.ccp import fclib
+from pctt.ccp.newton.linear import Settings
+from pctt.mat import from_differences
+from pctt.tt.conjugate import ConjugateGradients
+from pctt.tt.differences import Differences, FastInverse
+
+HARD = sorted((Path(__file__).parent / "ccp" / "hard").glob("*.h5"))
+MOST = {  # the sums, as counted
+    "methods": {
+        "apgd, relaxation, stored": {"iterations": 121},
+        "apgd, relaxation, heaps": {"iterations": 912},
+        "apgd, relaxation, wide masses": {"iterations": 888},
+        "conic, relaxation, stored": {"iterations": 20, "Krylov steps": 40},
+        "conic, relaxation, heaps": {"iterations": 102, "Krylov steps": 205},
+        "conic, relaxation, wide masses": {"iterations": 102, "Krylov steps": 204},
+        "pdip, relaxation, stored": {"iterations": 40, "Krylov steps": 491},
+        "pdip, relaxation, heaps": {"iterations": 239, "Krylov steps": 2893},
+        "pdip, relaxation, wide masses": {"iterations": 231, "Krylov steps": 2591},
+        "auto, relaxation, stored": {"iterations": 66, "Krylov steps": 36, "Newton steps": 18},
+        "auto, relaxation, heaps": {"iterations": 335, "Krylov steps": 191, "Newton steps": 95},
+        "auto, relaxation, wide masses": {"iterations": 328, "Krylov steps": 176, "Newton steps": 88},
+        "barzilai_borwein, relaxation, stored": {"iterations": 200},
+        "barzilai_borwein, relaxation, heaps": {"iterations": 1180},
+        "gauss_seidel, relaxation, stored": {"iterations": 180},
+        "gauss_seidel, relaxation, heaps": {"iterations": 1840},
+        "gauss_seidel, relaxation, wide masses": {"iterations": 3440},
+        "apgd, coulomb, stored": {"iterations": 103},
+        "apgd, coulomb, heaps": {"iterations": 977},
+        "apgd, coulomb, wide masses": {"iterations": 1359},
+        "conic, coulomb, stored": {"iterations": 26, "Krylov steps": 55},
+        "conic, coulomb, heaps": {"iterations": 128, "Krylov steps": 264},
+        "conic, coulomb, wide masses": {"iterations": 137, "Krylov steps": 284},
+        "auto, coulomb, stored": {"iterations": 103},
+        "auto, coulomb, heaps": {"iterations": 939, "Krylov steps": 22, "Newton steps": 11},
+        "auto, coulomb, wide masses": {"iterations": 797, "Krylov steps": 24, "Newton steps": 12},
+        "barzilai_borwein, coulomb, stored": {"iterations": 380, "more cone problems": 12},
+        "barzilai_borwein, coulomb, heaps": {"iterations": 3180, "more cone problems": 117},
+        "auto, 1e-7": {"iterations": 2566, "Krylov steps": 377, "Newton steps": 187},
+        "a jam comes loose": {"iterations": 243, "Krylov steps": 1380},
+    },
+    "systems": {
+        "pdip, contact": {"iterations": 181, "Krylov steps": 2422, "PCSetUp": 181, "PCApply": 5048},
+        "conic, contact": {"iterations": 82, "Krylov steps": 2130, "PCSetUp": 82, "PCApply": 4426},
+        "pdip, body": {"iterations": 181, "Krylov steps": 1322, "PCSetUp": 181, "PCApply": 1322},
+        "conic, body": {"iterations": 85, "Krylov steps": 1087, "PCSetUp": 87, "PCApply": 1089},
+        "pdip, factor": {"iterations": 181, "Krylov steps": 408, "PCSetUp": 189, "PCApply": 416},
+        "conic, factor": {"iterations": 83, "Krylov steps": 170, "PCSetUp": 91, "PCApply": 178},
+        "pdip, short": {"iterations": 179, "Krylov steps": 2011, "fallbacks": 94, "PCSetUp": 271, "PCApply": 4220},
+        "conic, short": {"iterations": 82, "Krylov steps": 1826, "fallbacks": 100, "PCSetUp": 144, "PCApply": 3818},
+        "pdip, petsc": {"iterations": 180, "Krylov steps": 214, "PCSetUp": 180, "PCApply": 214},
+        "conic, petsc": {"iterations": 84, "Krylov steps": 163, "PCSetUp": 84, "PCApply": 163},
+    },
+    "trains": {
+        "cross": {"evaluations": 160235, "sweeps": 10, "ranks": 345, "error [1e-4]": 9},
+        "inverse": {"ranks": 702, "sweeps": 17, "residual [1e-4]": 48},
+    },
+    "preconditioners": {
+        "a matrix that changes, none": {"steps": 53, "new trains": 4},
+        "a matrix that changes, cores": {"steps": 50, "new trains": 4},
+        "a matrix that changes, trains": {"steps": 129, "new trains": 2},
+        "transforms by choice": {"steps": 16},
+        "three quarters of a cosine transform": {"steps": 172},
+    },
+    "steps": {
+        "all": {
+            "calls of compiled loops": 48068, "exchanges of halos": 15318, "contacts of the search": 18741,
+            "pairs in lists": 44277, "new lists": 12, "iterations": 7096, "cone problems": 120,
+        },
+    },
+}  # fmt: skip
+
+
+def tally(name: str, results: Iterable[ccp.Result]) -> Counter[str]:
+    """The sums over results that all have converged."""
+    counts: Counter[str] = Counter()
+    for result in results:
+        assert result.converged, result.reason
+        each = {"iterations": result.iterations, "Krylov steps": result.ksp_its, "fallbacks": result.fallbacks}
+        each["more cone problems"] = result.cone_problems - 1
+        if result.newton_its != result.iterations:
+            each["Newton steps"] = result.newton_its
+        counts.update({f"{name}: {what}": count for what, count in each.items()})
+    return counts
+
+
+def stored() -> list[tuple[ccp.ConeProblem, np.ndarray]]:
+    """Hard steps, with their first guesses."""
+    problems = [fclib.load(path, SELF) for path in HARD]
+    return [(each.problem, each.guess) for each in problems]
+
+
+def heaps(count: int = 10, contacts: int = 60, bodies: int = 30, **more) -> list[tuple[ccp.ConeProblem, None]]:
+    """Random problems."""
+    return [(from_graph(*heap(seed, contacts, bodies, **more)), None) for seed in range(count)]
+
+
+def methods(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """All methods with either law; fixed points of De Saxce's terms by a method without the law."""
+    counts: Counter[str] = Counter()
+    problems = {"stored": stored(), "heaps": heaps(), "wide masses": heaps(mass_ratio=1e3)}
+    cases = [(ccp.RELAXATION, each) for each in ("apgd", "conic", "pdip", "auto", "barzilai_borwein", "gauss_seidel")]
+    cases += [(ccp.COULOMB, each) for each in ("apgd", "conic", "auto", "barzilai_borwein")]
+    for law, method in cases:
+        limits = ccp.Limits(1e-5 if method in ("conic", "pdip") else 1e-4)
+        for name, each in list(problems.items())[: 2 if method == "barzilai_borwein" else 3]:
+            solved = (ccp.solve(*given, type=method, law=law, limits=limits) for given in each)
+            counts += tally(f"{method}, {law}, {name}", solved)
+    exact = (ccp.solve(*given, type="auto", law=law, limits=ccp.Limits(1e-7)) for given in heaps() for law in ccp.LAWS)
+    counts += tally("auto, 1e-7", exact)
+    loose = []
+    for seed, (problem, _) in enumerate(heaps(bodies=50)):
+        guess = np.zeros_like(problem.r)
+        guess[:, 0] = 1e6 * np.random.default_rng(seed).uniform(0.5, 2.0, len(guess))
+        loose += [ccp.solve(problem, guess, type=method, law=ccp.RELAXATION) for method in ("pdip", "conic")]
+    return counts + tally("a jam comes loose", loose)
+
+
+def systems(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """Newton systems of one object for several problems, in each form, by Krylov methods, factors and fallbacks."""
+    patch.setattr(Settings, "few", 0)
+    PETSc.Log.begin()
+    events = {name: PETSc.Log.Event(name) for name in ("PCSetUp", "PCApply")}
+    counts: Counter[str] = Counter()
+    cases = {
+        "contact": ("contact", {}), "body": ("body", {}), "factor": ("body", {"easy": 0.1}),
+        "short": ("contact", {"ccp_ksp_max_it": 12}), "petsc": ("body", {"ccp_pc_type": "cholesky"}),
+    }  # fmt: skip
+    for name, (form, changes) in cases.items():
+        for method in ("pdip", "conic"):
+            with pytest.MonkeyPatch.context() as more:
+                for key, value in changes.items():
+                    if key.startswith("ccp_"):
+                        PETSc.Options()[key] = value
+                    else:
+                        more.setattr(Settings, key, value)
+                newton = ccp.Newton(SELF, form)
+                before = {event: log.getPerfInfo()["count"] for event, log in events.items()}
+                problems = [*stored(), *heaps(6, 100, 50, mass_ratio=100.0)]
+                solved = [
+                    ccp.solve(*given, type=method, law=ccp.RELAXATION, newton=newton, limits=ccp.Limits(1e-5))
+                    for given in problems
+                ]
+                counts += tally(f"{method}, {name}", solved)
+                for event, log in events.items():
+                    counts[f"{method}, {name}: {event}"] = log.getPerfInfo()["count"] - before[event]
+                newton.destroy()
+                for key in changes:
+                    PETSc.Options().delValue(key)
+    return counts
+
+
+def trains(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """Ranks, evaluations and sweeps of trains, and steps of conjugate gradients with them."""
+    counts: Counter[str] = Counter()
+
+    def entries(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        apart = np.subtract(np.unravel_index(i, (32, 32)), np.unravel_index(j, (32, 32))) / 32
+        return 2.0 * (i == j) + np.exp(-np.sqrt((apart**2).sum(axis=0)) / 0.3)
+
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        cross = tt.compress_cross(tt.EntryMatrix(entries, tt.GridDigits((32, 32))), 30, 1e-3, rng=rng)
+        line = sp.diags([-1.0, 2.0 + 0.1 * rng.random(32), -1.0], [-1, 0, 1], shape=(32, 32))
+        laplacian = (sp.kronsum(line, line) + sp.identity(1024) / 32).toarray()
+        inverse = tt.invert(tt.decompose_matrix(laplacian, (2,) * 10, eps=1e-12), 60, sweeps=20, eps=1e-3, rng=rng)
+        counts["cross: evaluations"] += cross.evaluations
+        counts["cross: sweeps"] += cross.sweeps
+        counts["cross: ranks"] += sum(cross.train.ranks)
+        counts["cross: error [1e-4]"] += round(1e4 * cross.error)
+        counts["inverse: ranks"] += sum(inverse.train.ranks)
+        counts["inverse: sweeps"] += inverse.sweeps
+        counts["inverse: residual [1e-4]"] += round(1e4 * inverse.residual)
+    return counts
+
+
+def preconditioners(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """Steps of conjugate gradients with trains that are kept or new, and with transforms."""
+    counts: Counter[str] = Counter()
+    for reuse in ("none", "cores", "trains"):
+        mat = poisson(24)
+        ksp = ready(mat, rank=10, reuse=reuse)
+        for shift in (0.0, 0.3, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0):
+            mat.shift(shift)
+            steps, left = solve(ksp)
+            assert left < 1e-6
+            counts[f"a matrix that changes, {reuse}: steps"] += steps
+        account = context(ksp).account
+        counts[f"a matrix that changes, {reuse}: new trains"] = account.setups - account.kept
+    for length in (1.0, 3.0, 10.0):
+        ksp = ready(from_differences(lambda s, length=length: np.exp(-np.sqrt((s**2).sum(axis=0)) / length), (24, 20)))
+        counts["transforms by choice: steps"] += solve(ksp)[0]
+        away = np.sqrt((np.indices((40, 40)) ** 2.0).sum(axis=0)) / (3 * length)
+        a = Differences.of_even((1 + away) * np.exp(-away))
+        b, mean = np.random.default_rng(0).standard_normal(1600), FastInverse(a, (("cosine", 0.75), ("sine", 0.25)))
+        run = ConjugateGradients(a.times, b, mean.solve)
+        while run.norms[-1] > 1e-8 * run.norms[0]:
+            run.step()
+        counts["three quarters of a cosine transform: steps"] += len(run.norms)
+    return counts
+
+
+def steps(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """Of a falling, then a resting heap: what the search finds, how often it looks, and what is called."""
+    counts: Counter[str] = Counter()
+    call = Loop.__call__
+
+    def counted(self, *arguments):
+        counts["all: calls of compiled loops"] += 1
+        return call(self, *arguments)
+
+    def exchange_of(name):
+        begin = getattr(Halo, name)
+
+        def begun(self, values):
+            counts["all: exchanges of halos"] += 1
+            begin(self, values)
+
+        return begun
+
+    patch.setattr(Loop, "__call__", counted)
+    for name in ("begin_update", "begin_add"):
+        patch.setattr(Halo, name, exchange_of(name))
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        scene = Scene(friction=0.4)
+        grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        place, speed = 0.105 + 0.21 * grid + rng.uniform(-0.005, 0.005, grid.shape), rng.normal(0, 2.0, grid.shape)
+        scene.add_spheres(place, 0.1, 1000.0, velocity=speed)
+        scene.add_body("walls", [Plane((0, 0, 1)), *(Plane(n, p) for n, p in WALLS)])
+        with pctt.Simulation(scene, dt=0.005, say=lambda _: None) as sim:
+            for _ in range(40):
+                before = sim.world.lists
+                sim.run(steps=1)
+                lists = sim.world.lists
+                counts["all: contacts of the search"] += len(sim.last.contacts)
+                counts["all: pairs in lists"] += len(lists.own.other) + len(lists.away.other)
+                counts["all: new lists"] += lists is not before
+                counts["all: iterations"] += sim.figures["iterations"]
+                counts["all: cone problems"] += sim.figures["cone_problems"]
+    return counts
+
+
+WALLS = [((1, 0, 0), (0, 0, 0)), ((-1, 0, 0), (0.84, 0, 0)), ((0, 1, 0), (0, 0, 0)), ((0, -1, 0), (0, 0.84, 0))]
+
+
+@pytest.mark.parametrize("group", [methods, systems, trains, preconditioners, steps], ids=lambda group: group.__name__)
+def test_no_count_has_grown(group, monkeypatch):
+    most = {f"{of}: {what}": count for of, row in MOST[group.__name__].items() for what, count in row.items()}
+    found = {name: count for name, count in group(monkeypatch).items() if count or name in most}
+    grown = {name: (most.get(name), count) for name, count in found.items() if count > 1.15 * most.get(name, 0) + 1}
+    assert not grown, "(in the table, counted)"
+    assert not most.keys() - found.keys(), "not counted any more"
