@@ -9,7 +9,7 @@ from problems import SELF, from_graph, heap, part
 from test_unbounded import squeezed
 
 from pctt import ccp
-from pctt.ccp import Limits, Status
+from pctt.ccp import Limits, Status, auto
 from pctt.ccp.auto import Auto
 from pctt.ccp.newton.linear import Settings
 
@@ -111,3 +111,24 @@ def test_a_result_has_the_momenta_of_its_impulses(type):
     result = ccp.solve(problem, type=type, law=ccp.RELAXATION)
     assert np.array_equal(result.momentum, problem.momentum(result.impulse))
     assert np.allclose(result.momentum, graph.dense().T @ result.impulse.ravel())
+
+
+def test_the_conic_method_begins_where_apgd_ends(monkeypatch):
+    begun, ended = [], []
+    method, first = auto.conic.solve, auto.apgd.solve
+
+    def noted(problem, guess, *rest, **more):
+        begun.append(guess)
+        return method(problem, guess, *rest, **more)
+
+    def ending(*given, **more):
+        ended.append(first(*given, **more))
+        return ended[-1]
+
+    monkeypatch.setattr(auto.conic, "solve", noted)
+    monkeypatch.setattr(auto.apgd, "solve", ending)
+    known, graph = heap(3)
+    result = ccp.solve(from_graph(known, graph), type="auto", limits=ccp.Limits(1e-7), law=ccp.RELAXATION)
+    assert result.converged
+    np.testing.assert_array_equal(begun[0], ended[0].impulse)
+    assert begun[0].any()

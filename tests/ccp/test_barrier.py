@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pctt.ccp.interior.pdip import PerspectiveConstraint
+from pctt.ccp.interior.pdip import PDIP, PerspectiveConstraint, _next_damping
 
 
 def inside(count: int = 60, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -83,3 +83,12 @@ def test_barrier_blocks_are_symmetric_and_positive_definite_inside(towards_surfa
     assert np.allclose(blocks[~rough, 0, 0], (lam / g[:, 0])[~rough])
     assert (blocks[~rough][:, [1, 2], [1, 2]] >= 1e11 * blocks[~rough, 0, 0][:, None]).all()
     assert (blocks[~rough][:, 0, 1:] == 0).all()
+
+
+def test_after_short_steps_near_the_solution_the_proximal_term_stays_until_steps_are_long():
+    options, near = PDIP(), 1e-4
+    factors = [0.0]
+    for step in (0.1, 0.1, 0.5, 0.9, 0.9):
+        factors.append(_next_damping(factors[-1], step, near, options))
+    assert 0.0 < factors[1] <= factors[2] == factors[3] > factors[4] > factors[5]
+    assert _next_damping(factors[1], 0.1, 1e-2, options) == 0.0  # impulses may have to grow

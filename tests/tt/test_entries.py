@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pctt import tt
+from pctt.tt.cross import _dominant
 
 GRIDS = st.lists(st.integers(1, 7), min_size=1, max_size=3).map(tuple)
 
@@ -96,3 +97,14 @@ def test_the_cost_does_not_grow_with_the_grid() -> None:
         assert found.error < 1e-4
         looked.append(found.evaluations)
     assert looked[1] < 6 * looked[0]
+
+
+def test_the_rows_of_a_cross_are_nearly_of_maximal_volume() -> None:
+    """No row is more than 1.1 times any of them: Kahan's matrix, where pivoted orthogonalisation chooses badly."""
+    n, c = 30, 0.3
+    upper = np.diag((1 - c**2) ** (0.5 * np.arange(n))) @ (np.eye(n) - c * np.triu(np.ones((n, n)), 1))
+    C = np.concatenate([upper.T, np.random.default_rng(0).standard_normal((60, n)) @ upper])
+    for rank in (5, 10, 30):
+        U, rows = _dominant(C, rank, 0.0)
+        np.testing.assert_allclose(U[rows], np.eye(rank), atol=1e-8)
+        assert np.abs(U).max() <= 1.1

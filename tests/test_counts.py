@@ -1,0 +1,298 @@
+"""Speed is tested by counts, which do not depend on the clock: none may grow by more than 15 %.
+
+Problems are of fixed seeds. Counts are sums over several of them, as last bits change one of them a little. Who makes
+the methods better puts the new numbers into the table.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from petsc4py import PETSc
+from problems import SELF, Known, from_graph, heap, random_graph
+from train_solver import context, poisson, ready, solve
+
+import pctt
+from dem.compiled import Loop
+from dem.contact_map import Halo
+from dem.scene import Scene
+from dem.shapes import Plane
+from pctt import ccp, tt
+from pctt.ccp import fclib
+from pctt.ccp.newton.linear import Settings
+from pctt.mat import from_differences
+from pctt.tt.conjugate import ConjugateGradients
+from pctt.tt.differences import Differences, FastInverse
+
+HARD = sorted((Path(__file__).parent / "ccp" / "hard").glob("*.h5"))
+MOST = {  # the sums, as counted
+    "methods": {
+        "apgd, relaxation, stored": {"iterations": 121},
+        "apgd, relaxation, heaps": {"iterations": 912},
+        "apgd, relaxation, wide masses": {"iterations": 888},
+        "conic, relaxation, stored": {"iterations": 20, "Krylov steps": 40},
+        "conic, relaxation, heaps": {"iterations": 102, "Krylov steps": 205},
+        "conic, relaxation, wide masses": {"iterations": 102, "Krylov steps": 204},
+        "pdip, relaxation, stored": {"iterations": 40, "Krylov steps": 491},
+        "pdip, relaxation, heaps": {"iterations": 239, "Krylov steps": 2893},
+        "pdip, relaxation, wide masses": {"iterations": 231, "Krylov steps": 2591},
+        "auto, relaxation, stored": {"iterations": 66, "Krylov steps": 36, "Newton steps": 18},
+        "auto, relaxation, heaps": {"iterations": 335, "Krylov steps": 191, "Newton steps": 95},
+        "auto, relaxation, wide masses": {"iterations": 328, "Krylov steps": 176, "Newton steps": 88},
+        "barzilai_borwein, relaxation, stored": {"iterations": 200},
+        "barzilai_borwein, relaxation, heaps": {"iterations": 1180},
+        "gauss_seidel, relaxation, stored": {"iterations": 180},
+        "gauss_seidel, relaxation, heaps": {"iterations": 1840},
+        "gauss_seidel, relaxation, wide masses": {"iterations": 3440},
+        "apgd, coulomb, stored": {"iterations": 103},
+        "apgd, coulomb, heaps": {"iterations": 977},
+        "apgd, coulomb, wide masses": {"iterations": 1359},
+        "conic, coulomb, stored": {"iterations": 26, "Krylov steps": 55},
+        "conic, coulomb, heaps": {"iterations": 128, "Krylov steps": 264},
+        "conic, coulomb, wide masses": {"iterations": 137, "Krylov steps": 284},
+        "auto, coulomb, stored": {"iterations": 103},
+        "auto, coulomb, heaps": {"iterations": 939, "Krylov steps": 22, "Newton steps": 11},
+        "auto, coulomb, wide masses": {"iterations": 797, "Krylov steps": 24, "Newton steps": 12},
+        "barzilai_borwein, coulomb, stored": {"iterations": 380, "more cone problems": 12},
+        "barzilai_borwein, coulomb, heaps": {"iterations": 3180, "more cone problems": 117},
+        "conic, coulomb, wedged": {"iterations": 103, "Krylov steps": 236},
+        "conic, relaxation, wedged": {"iterations": 66, "Krylov steps": 168},
+        "auto, 1e-7": {"iterations": 2566, "Krylov steps": 377, "Newton steps": 187},
+        "a jam comes loose": {"iterations": 243, "Krylov steps": 1380},
+    },
+    "systems": {
+        "pdip, contact": {"iterations": 135, "Krylov steps": 1824, "PCSetUp": 135, "PCApply": 3800},
+        "conic, contact": {"iterations": 61, "Krylov steps": 1554, "PCSetUp": 61, "PCApply": 3232},
+        "pdip, body": {"iterations": 134, "Krylov steps": 991, "PCSetUp": 134, "PCApply": 991},
+        "conic, body": {"iterations": 63, "Krylov steps": 698, "PCSetUp": 64, "PCApply": 699},
+        "pdip, factor": {"iterations": 135, "Krylov steps": 298, "PCSetUp": 141, "PCApply": 304},
+        "conic, factor": {"iterations": 61, "Krylov steps": 126, "PCSetUp": 67, "PCApply": 132},
+        "pdip, short": {"iterations": 133, "Krylov steps": 1507, "fallbacks": 75, "PCSetUp": 206, "PCApply": 3161},
+        "conic, short": {"iterations": 61, "Krylov steps": 1359, "fallbacks": 73, "PCSetUp": 107, "PCApply": 2842},
+        "pdip, petsc": {"iterations": 133, "Krylov steps": 160, "PCSetUp": 133, "PCApply": 160},
+        "conic, petsc": {"iterations": 62, "Krylov steps": 121, "PCSetUp": 62, "PCApply": 121},
+    },
+    "trains": {
+        "cross": {"evaluations": 160235, "sweeps": 10, "ranks": 345, "error [1e-4]": 9},
+        "inverse": {"ranks": 702, "sweeps": 17, "residual [1e-4]": 48},
+    },
+    "preconditioners": {
+        "a matrix that changes, none": {"steps": 53, "new trains": 4},
+        "a matrix that changes, cores": {"steps": 50, "new trains": 4},
+        "a matrix that changes, trains": {"steps": 129, "new trains": 2},
+        "transforms by choice": {"steps": 16},
+        "three quarters of a cosine transform": {"steps": 172},
+    },
+    "steps": {
+        "thrown": {
+            "calls of compiled loops": 43546, "contacts of the search": 16036, "pairs in lists": 41886, "new lists": 6,
+            "iterations": 6553, "cone problems": 100,
+        },
+        "halo": {"begin_update": 9565, "begin_add": 8719},
+        "falling": {
+            "calls of compiled loops": 16250, "contacts of the search": 10993, "pairs in lists": 21582, "new lists": 2,
+            "iterations": 1626, "cone problems": 100,
+        },
+    },
+}  # fmt: skip
+
+
+def tally(name: str, results: Iterable[ccp.Result]) -> Counter[str]:
+    """The sums over results that all have converged."""
+    counts: Counter[str] = Counter()
+    for result in results:
+        assert result.converged, result.reason
+        each = {"iterations": result.iterations, "Krylov steps": result.ksp_its, "fallbacks": result.fallbacks}
+        each["more cone problems"] = result.cone_problems - 1
+        if result.newton_its != result.iterations:
+            each["Newton steps"] = result.newton_its
+        counts.update({f"{name}: {what}": count for what, count in each.items()})
+    return counts
+
+
+def stored() -> list[tuple[ccp.ConeProblem, np.ndarray]]:
+    """Hard steps, with their first guesses."""
+    problems = [fclib.load(path, SELF) for path in HARD]
+    return [(each.problem, each.guess) for each in problems]
+
+
+def heaps(count: int = 10, contacts: int = 60, bodies: int = 30, **more) -> list[tuple[ccp.ConeProblem, None]]:
+    """Random problems."""
+    return [(from_graph(*heap(seed, contacts, bodies, **more)), None) for seed in range(count)]
+
+
+def wedged(count: int = 8, contacts: int = 60, bodies: int = 6) -> list[tuple[ccp.ConeProblem, None]]:
+    """Few bodies that move against many contacts, which may hold each other."""
+    problems = []
+    for seed in range(count):
+        graph = random_graph(seed, contacts, bodies)
+        r = graph.dense() @ np.random.default_rng(seed).normal(size=6 * bodies)
+        problems.append((from_graph(Known(None, r.reshape(-1, 3), np.full(contacts, 0.3), None, None), graph), None))
+    return problems
+
+
+def methods(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """All methods with either law; fixed points of De Saxce's terms by a method without the law."""
+    counts: Counter[str] = Counter()
+    problems = {"stored": stored(), "heaps": heaps(), "wide masses": heaps(mass_ratio=1e3)}
+    cases = [(ccp.RELAXATION, each) for each in ("apgd", "conic", "pdip", "auto", "barzilai_borwein", "gauss_seidel")]
+    cases += [(ccp.COULOMB, each) for each in ("apgd", "conic", "auto", "barzilai_borwein")]
+    for law, method in cases:
+        limits = ccp.Limits(1e-5 if method in ("conic", "pdip") else 1e-4)
+        for name, each in list(problems.items())[: 2 if method == "barzilai_borwein" else 3]:
+            solved = (ccp.solve(*given, type=method, law=law, limits=limits) for given in each)
+            counts += tally(f"{method}, {law}, {name}", solved)
+    for law in ccp.LAWS:
+        solved = (ccp.solve(*given, type="conic", law=law, limits=ccp.Limits(1e-6)) for given in wedged())
+        counts += tally(f"conic, {law}, wedged", solved)
+    exact = (ccp.solve(*given, type="auto", law=law, limits=ccp.Limits(1e-7)) for given in heaps() for law in ccp.LAWS)
+    counts += tally("auto, 1e-7", exact)
+    loose = []
+    for seed, (problem, _) in enumerate(heaps(bodies=50)):
+        guess = np.zeros_like(problem.r)
+        guess[:, 0] = 1e6 * np.random.default_rng(seed).uniform(0.5, 2.0, len(guess))
+        loose += [ccp.solve(problem, guess, type=method, law=ccp.RELAXATION) for method in ("pdip", "conic")]
+    return counts + tally("a jam comes loose", loose)
+
+
+def systems(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """Newton systems of one object for several problems, in each form, by Krylov methods, factors and fallbacks."""
+    patch.setattr(Settings, "few", 0)
+    PETSc.Log.begin()
+    events = {name: PETSc.Log.Event(name) for name in ("PCSetUp", "PCApply")}
+    counts: Counter[str] = Counter()
+    cases = {
+        "contact": ("contact", {}), "body": ("body", {}), "factor": ("body", {"easy": 0.1}),
+        "short": ("contact", {"ccp_ksp_max_it": 12}), "petsc": ("body", {"ccp_pc_type": "cholesky"}),
+    }  # fmt: skip
+    for name, (form, changes) in cases.items():
+        for method in ("pdip", "conic"):
+            with pytest.MonkeyPatch.context() as more:
+                for key, value in changes.items():
+                    if key.startswith("ccp_"):
+                        PETSc.Options()[key] = value
+                    else:
+                        more.setattr(Settings, key, value)
+                newton = ccp.Newton(SELF, form)
+                before = {event: log.getPerfInfo()["count"] for event, log in events.items()}
+                problems = [*stored(), *heaps(4, 100, 50, mass_ratio=100.0)]
+                solved = [
+                    ccp.solve(*given, type=method, law=ccp.RELAXATION, newton=newton, limits=ccp.Limits(1e-5))
+                    for given in problems
+                ]
+                counts += tally(f"{method}, {name}", solved)
+                for event, log in events.items():
+                    counts[f"{method}, {name}: {event}"] = log.getPerfInfo()["count"] - before[event]
+                newton.destroy()
+                for key in changes:
+                    PETSc.Options().delValue(key)
+    return counts
+
+
+def trains(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """Ranks, evaluations and sweeps of trains, and steps of conjugate gradients with them."""
+    counts: Counter[str] = Counter()
+
+    def entries(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        apart = np.subtract(np.unravel_index(i, (32, 32)), np.unravel_index(j, (32, 32))) / 32
+        return 2.0 * (i == j) + np.exp(-np.sqrt((apart**2).sum(axis=0)) / 0.3)
+
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        cross = tt.compress_cross(tt.EntryMatrix(entries, tt.GridDigits((32, 32))), 30, 1e-3, rng=rng)
+        line = sp.diags([-1.0, 2.0 + 0.1 * rng.random(32), -1.0], [-1, 0, 1], shape=(32, 32))
+        laplacian = (sp.kronsum(line, line) + sp.identity(1024) / 32).toarray()
+        inverse = tt.invert(tt.decompose_matrix(laplacian, (2,) * 10, eps=1e-12), 60, sweeps=20, eps=1e-3, rng=rng)
+        counts["cross: evaluations"] += cross.evaluations
+        counts["cross: sweeps"] += cross.sweeps
+        counts["cross: ranks"] += sum(cross.train.ranks)
+        counts["cross: error [1e-4]"] += round(1e4 * cross.error)
+        counts["inverse: ranks"] += sum(inverse.train.ranks)
+        counts["inverse: sweeps"] += inverse.sweeps
+        counts["inverse: residual [1e-4]"] += round(1e4 * inverse.residual)
+    return counts
+
+
+def preconditioners(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """Steps of conjugate gradients with trains that are kept or new, and with transforms."""
+    counts: Counter[str] = Counter()
+    for reuse in ("none", "cores", "trains"):
+        mat = poisson(24)
+        ksp = ready(mat, rank=10, reuse=reuse)
+        for shift in (0.0, 0.3, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0):
+            mat.shift(shift)
+            steps, left = solve(ksp)
+            assert left < 1e-6
+            counts[f"a matrix that changes, {reuse}: steps"] += steps
+        account = context(ksp).account
+        counts[f"a matrix that changes, {reuse}: new trains"] = account.setups - account.kept
+    for length in (1.0, 3.0, 10.0):
+        ksp = ready(from_differences(lambda s, length=length: np.exp(-np.sqrt((s**2).sum(axis=0)) / length), (24, 20)))
+        counts["transforms by choice: steps"] += solve(ksp)[0]
+        away = np.sqrt((np.indices((40, 40)) ** 2.0).sum(axis=0)) / (3 * length)
+        a = Differences.of_even((1 + away) * np.exp(-away))
+        b, mean = np.random.default_rng(0).standard_normal(1600), FastInverse(a, (("cosine", 0.75), ("sine", 0.25)))
+        run = ConjugateGradients(a.times, b, mean.solve)
+        while run.norms[-1] > 1e-8 * run.norms[0]:
+            run.step()
+        counts["three quarters of a cosine transform: steps"] += len(run.norms)
+    return counts
+
+
+def steps(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """Of a falling, then a resting heap: what the search finds, how often it looks, and what is called."""
+    counts: Counter[str] = Counter()
+    call = Loop.__call__
+
+    def counted(self, *arguments):
+        counts[f"{name}: calls of compiled loops"] += 1
+        return call(self, *arguments)
+
+    def exchange_of(name):
+        begin = getattr(Halo, name)
+
+        def begun(self, values):
+            counts[f"halo: {name}"] += 1
+            begin(self, values)
+
+        return begun
+
+    patch.setattr(Loop, "__call__", counted)
+    for name in ("begin_update", "begin_add"):
+        patch.setattr(Halo, name, exchange_of(name))
+    for name, seed in (("thrown", 0), ("thrown", 1), ("falling", 2), ("falling", 3)):
+        rng = np.random.default_rng(seed)
+        scene = Scene(friction=0.4)
+        grid = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        place = 0.105 + 0.21 * grid + rng.uniform(-0.005, 0.005, grid.shape)
+        speed = rng.normal(0, 2.0, grid.shape) * (name == "thrown")
+        scene.add_spheres(place, 0.1, 1000.0, velocity=speed)
+        scene.add_body("walls", [Plane((0, 0, 1)), *(Plane(n, p) for n, p in WALLS)])
+        with pctt.Simulation(scene, dt=0.005, say=lambda _: None) as sim:
+            for _ in range(50):
+                before = sim.world.lists
+                sim.run(steps=1)
+                lists = sim.world.lists
+                counts[f"{name}: contacts of the search"] += len(sim.last.contacts)
+                counts[f"{name}: pairs in lists"] += len(lists.own.other) + len(lists.away.other)
+                counts[f"{name}: new lists"] += lists is not before
+                counts[f"{name}: iterations"] += sim.figures["iterations"]
+                counts[f"{name}: cone problems"] += sim.figures["cone_problems"]
+    return counts
+
+
+WALLS = [((1, 0, 0), (0, 0, 0)), ((-1, 0, 0), (0.84, 0, 0)), ((0, 1, 0), (0, 0, 0)), ((0, -1, 0), (0, 0.84, 0))]
+
+
+@pytest.mark.parametrize("group", [methods, systems, trains, preconditioners, steps], ids=lambda group: group.__name__)
+def test_no_count_has_grown(group, monkeypatch):
+    most = {f"{of}: {what}": count for of, row in MOST[group.__name__].items() for what, count in row.items()}
+    found = {name: count for name, count in group(monkeypatch).items() if count or name in most}
+    grown = {name: (most.get(name), count) for name, count in found.items() if count > 1.15 * most.get(name, 0) + 1}
+    assert not grown, "(in the table, counted)"
+    assert not most.keys() - found.keys(), "not counted any more"
