@@ -56,6 +56,7 @@ class Joint(Named):
     strength: float = np.inf  #: the greatest torque [N m] or force [N] of the motor
     low: float = -np.inf  #: least angle [rad] or position [m]
     high: float = np.inf  #: greatest one
+    touching: bool = False  #: whether its two bodies also touch each other
     CHANGED: ClassVar = ("speed", "target", "strength", "low", "high")
     KEPT: ClassVar = CHANGED
 

@@ -426,6 +426,7 @@ class Scene:
         target: float | None = None,
         strength: float = np.inf,
         limits: Sequence[float] = (-np.inf, np.inf),
+        touching: bool = False,
     ) -> None:
         """Join two bodies, or a body and the world (None), by a "hinge", "slider", "ball" or "fixed" joint, see
         `dem.joints`.
@@ -433,7 +434,8 @@ class Scene:
         A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,) are in the
         world at time zero, where angle and position are zero; they are those of `other` relative to `one`. A motor
         keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a torque or force of at most `strength`
-        [N m, N]; inf: as much as it takes. `limits` (2,): least and greatest angle [rad] or position [m].
+        [N m, N]; inf: as much as it takes. `limits` (2,): least and greatest angle [rad] or position [m]. The two
+        bodies go through each other, unless they are `touching`.
         """
         if not name or name in self.joints:
             raise ValueError(f"joints need distinct names, got {name!r}")
@@ -451,7 +453,8 @@ class Scene:
             if body.name in (one, other) and isinstance(body.motion, Driven):
                 raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
         low, high = map(float, limits)
-        self.joints[name] = Joint(kind, (one, other), anchors, frames, speed, target, float(strength), low, high)
+        motor = speed, target, float(strength)
+        self.joints[name] = Joint(kind, (one, other), anchors, frames, *motor, low, high, touching)
 
     def pose(self, what: str, end: End) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) of an end of a spring or joint at time 0; ValueError if there is none."""

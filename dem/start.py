@@ -174,6 +174,10 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
             raise ValueError(f"{what} {tied[0]!r} holds a grain: with outlets {what}s may hold large bodies alone")
     world.shear = _shear(scene)
     world.joints = dict(scene.joints)
+    number = {body.name: int(id) for body, id in zip(world.large_bodies, world.large.id)}
+    ends = [joint.ends for joint in world.joints.values() if None not in joint.ends and not joint.touching]
+    ids = [sorted(end if isinstance(end, int) else number[str(end)] for end in pair) for pair in ends]  # type: ignore[index]
+    world.apart = np.unique(np.array(ids, float).reshape(-1, 2) @ [1.0, 1.0j])
     if scene.deforms:
         none = np.full(3, np.nan)
         asked, strain = (none if given is None else given for given in (scene.stress, scene.strain_rate))
@@ -187,7 +191,8 @@ def _refuse_overlap(world: World, overlap: float) -> None:
     """ValueError, on all ranks, that names the worst pair if bodies overlap by more than `overlap` half thicknesses of
     the thinner one that forces move.
 
-    Large bodies that a joint joins may share a place, and so may those that no force can part (`held_overlap`)."""
+    Bodies that a joint joins may share a place, unless they are to touch, and so may those that no force can part
+    (`held_overlap`)."""
     contacts = find_contacts(world, 0.0)
     table = contacts.near.bodies
     worst = (0.0, 0.0, -1, -1)
@@ -197,10 +202,6 @@ def _refuse_overlap(world: World, overlap: float) -> None:
         half[large] = np.where(moves, [least_half(body) for body in world.large_bodies], np.inf)
         relative = -contacts.gap / np.minimum(half[contacts.a], half[contacts.b])
         pair = np.stack([table.id[contacts.a], table.id[contacts.b]], axis=1)
-        for joint in world.joints.values():
-            if all(isinstance(end, str) for end in joint.ends):
-                ends = sorted(world.large.id[world.large_row(str(end))] for end in joint.ends)
-                relative[(pair == ends).all(axis=1)] = 0.0
         c = int(np.argmax(relative))
         worst = (float(relative[c]), float(-contacts.gap[c]), int(pair[c, 0]), int(pair[c, 1]))
     relative_depth, depth, a, b = world.comm.allreduce(worst, MPI.MAX)

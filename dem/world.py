@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
-from dem.arrays import Floats, Ints
+from dem.arrays import Floats, Ints, Keys
 from dem.bodies import Bodies
 from dem.clumps import Form
 from dem.contact_law import ContactLaw
@@ -78,6 +78,8 @@ class World:
     loads: dict[str, Load] = field(default_factory=dict)  #: by name; `dem.changes.change` alone changes parts
     springs: dict[str, Spring] = field(default_factory=dict)  #: by name
     joints: dict[str, Joint] = field(default_factory=dict)  #: by name
+    #: pairs of ids, the lower + 1j the upper, of bodies that joints join and that do not touch each other
+    apart: Keys = field(default_factory=lambda: np.zeros(0, complex))
     period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
     sources: dict[str, Source] = field(default_factory=dict)  #: by name
     outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name

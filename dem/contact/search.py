@@ -130,6 +130,10 @@ def find_contacts(
         material = near.bodies.material[table.row]
         touch = world.pairs.touching[material[i], material[j]] > 0.0
         i, j, reach = i[touch], j[touch], reach[touch]
+    if len(world.apart):
+        one, other = near.bodies.id[table.row[i]], near.bodies.id[table.row[j]]
+        touch = places(world.apart, np.minimum(one, other) + 1j * np.maximum(one, other)) < 0
+        i, j, reach = i[touch], j[touch], reach[touch]
     table, i, j, reach = table.of_members(i, j, reach)
     moved: Floats | None = None
     swing: Floats | None = None

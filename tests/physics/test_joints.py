@@ -516,3 +516,16 @@ def test_a_joint_of_a_grain_is_refused_beside_an_outlet():
     scene.add_outlet("drain", Block((4, 4, 0), (5, 5, 3.9)))
     with pytest.raises(OptionError, match="joint 'pin' holds a grain"):
         simulation(scene)
+
+
+@pytest.mark.parametrize("touching", [False, True])
+def test_joined_bodies_touch_each_other_only_if_asked(touching):
+    """A slider draws two spheres together: they go through each other, or stop where they touch."""
+    scene = Scene(friction=0.5, gravity=(0, 0, 0))
+    one, two = scene.add_spheres([[0, 0, 0], [0.25, 0, 0]], 0.1, 1000.0)
+    motor = {"speed": -1.0, "strength": 1000.0, "touching": touching}
+    scene.add_joint("rail", one, two, kind="slider", anchor=(0, 0, 0), axis=(1, 0, 0), **motor)
+    sim = pctt.Simulation(scene, dt=0.005, solver="apgd", tol=1e-6, comm=MPI.COMM_SELF)
+    sim.run(steps=20)
+    gap = np.linalg.norm(sim.positions[1] - sim.positions[0])
+    assert gap == pytest.approx(0.2 if touching else 0.15, abs=2e-3)
