@@ -27,8 +27,7 @@ from pctt.ccp.cones import Array
 from pctt.ccp.coulomb import Coulomb, fixed_point
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
-from pctt.ccp.newton import Newton
-from pctt.ccp.newton.linear import Settings
+from pctt.ccp.newton import Newton, by_elimination
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
@@ -65,7 +64,7 @@ def solve(
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
     tried = Attempts(problem, limits, newton, coulomb)
-    few, small = newton.has_few(problem), problem.size <= Settings.few
+    few, small = newton.has_few(problem), problem.size <= by_elimination.FEW
     begun = min(limits.max_it, problem.comm.bcast(options.iterations(problem.size, limits.tol, coulomb, few)))
     first = tried.apgd(guess, begun)
     if first.converged and first.residual > limits.aimed:

@@ -13,15 +13,14 @@ from dem.exchange import offsets
 from pctt.ccp.cones import Array
 from pctt.ccp.delassus import GivenMatrix, rows_in_blocks
 from pctt.ccp.interior import conic
-from pctt.ccp.newton import Newton
-from pctt.ccp.newton.linear import Settings
+from pctt.ccp.newton import Newton, by_elimination
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 
 
 def takes(problem: ConeProblem, newton: Newton) -> bool:
     """Whether a problem has few contacts, on several ranks; the same on all."""
-    few = newton.takes_few and problem.comm.size > 1 and problem.size <= Settings.few
+    few = newton.own and problem.comm.size > 1 and problem.size <= by_elimination.FEW
     few = few and problem.has_entries and problem.cones.parts == 1
     return few and not problem.by_rows().has_hubs
 

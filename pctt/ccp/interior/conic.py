@@ -69,7 +69,7 @@ def solve(
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step."""
     given, problem, linear = problem, newton.begin(problem), newton.linear
-    if coulomb and not newton.takes_any:
+    if coulomb and not newton.linear.takes_unsymmetric:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
     conic = ConicProblem(problem, options, coulomb, newton.system.mends)

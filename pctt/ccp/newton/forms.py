@@ -8,12 +8,14 @@ barrier blocks after another. Both have
         momenta of its own mends; or it is one of velocities, (B + C) dg + G dv = q, where it opens what should touch
     speed : what a residual of 1 changes the velocities of contacts by, about
 
-and the functions of `ContactForm`. `FewForm` is that of the contacts with factors of its own, and
-`pctt.ccp.newton.kkt.KKTForm` has the multipliers as unknowns too.
+and the functions of `ContactForm`. `GivenForm` is that of contacts without bodies, and `pctt.ccp.newton.kkt.KKTForm`
+has the multipliers as unknowns too.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Union
 
@@ -24,9 +26,9 @@ from dem.contact_map.loops import local_product, pack
 from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.ccp.cones import Array
-from pctt.ccp.delassus import GivenMatrix
-from pctt.ccp.newton.few import Factors, Order
+from pctt.ccp.newton.defaults import DIRECT, FRONTS, Options
 from pctt.ccp.newton.fronts import Dissection, Fronts
+from pctt.ccp.newton.krylov import Source
 from pctt.ccp.problem import ConeProblem
 
 
@@ -47,9 +49,18 @@ class ContactForm:
     def __init__(self, problem: ConeProblem):
         self.problem, self.symmetric = problem, True
         self._entries: PETSc.Mat | None = None
+        self._current = True
+
+    @property
+    def matrix(self) -> PETSc.Mat:
+        """With the present values; no object of PETSc is made before it is asked for."""
+        if not self._current:
+            self._current = True
+            self._take_values()
+        return self._mat
 
     @cached_property
-    def matrix(self) -> PETSc.Mat:
+    def _mat(self) -> PETSc.Mat:
         return symmetric_shell(self.problem.comm, self.problem.r.size, 3, self._product)
 
     def load(self, problem: ConeProblem) -> None:
@@ -60,10 +71,13 @@ class ContactForm:
         """Make the matrix for the barrier blocks B (nc, 3, 3), or from ``inverse`` = (B + C)^-1 if the caller has it
         more accurately. ``symmetric`` says whether the blocks are."""
         assert barrier is not None
-        self._blocks, self._made, self.symmetric = self.problem.diagonal_blocks + barrier, False, symmetric
-        self._local = np.empty((len(barrier), 6))
-        pack(barrier + self.problem.compliance_blocks, self._local)
-        set_diagonal_blocks(self.matrix, self._blocks)
+        self.blocks, self._made, self.symmetric = self.problem.diagonal_blocks + barrier, False, symmetric
+        self._barrier, self._current = barrier, False
+
+    def _take_values(self) -> None:
+        self._local = np.empty((len(self._barrier), 6))
+        pack(self._barrier + self.problem.compliance_blocks, self._local)
+        set_diagonal_blocks(self._mat, self.blocks)
 
     def _product(self, g: Array, out: Array) -> None:
         g, out = g.reshape(-1, 3), out.reshape(-1, 3)
@@ -78,7 +92,7 @@ class ContactForm:
             self._entries = self._with_N(self._entries)
         self._loaded = True
         if not self._made:
-            put_diagonal_blocks(self._entries, self._blocks)
+            put_diagonal_blocks(self._entries, self.blocks)
             for name, value in (("coordinates", self.problem.point), ("key", self.problem.key)):
                 if value is not None:
                     self._entries.setAttr(name, value)
@@ -106,35 +120,28 @@ class ContactForm:
         """dv (6m,) of a solution with the impulses dg."""
         return self.problem.momentum(dg) - r_v
 
+    @property
+    def factored_by(self) -> Options:
+        """Options of the solver that makes factors."""
+        return DIRECT[self.symmetric]
+
+    @contextmanager
+    def to_factor(self, least: float) -> Iterator[Source]:
+        """What is to be factorised."""
+        yield self.entries
+
     def destroy(self) -> None:
-        if "matrix" in self.__dict__:
-            self.matrix.destroy()
+        if "_mat" in self.__dict__:
+            self._mat.destroy()
         if self._entries is not None:
             self._entries.destroy()
 
 
-class FewForm(ContactForm):
-    """The form of the contacts where a problem, given by N, has few of them on one rank: `Factors` solve it, and no
-    object of PETSc is made before these have failed."""
-
-    def __init__(self, problem: ConeProblem, order: Order):
-        self._order = order
-        super().__init__(problem)
-
-    def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
-        assert barrier is not None
-        assert isinstance(self.problem.operator, GivenMatrix)
-        self._barrier, self.symmetric = barrier, symmetric
-        blocks = self.problem.diagonal_blocks + barrier
-        self.factors = Factors(self.problem.operator.local, self._order, blocks, symmetric)
+class GivenForm(ContactForm):
+    """The form of the contacts of a problem that is given by N: its momenta are impulses, and r_v is rounding."""
 
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
-        """q: momenta are impulses here, and r_v is rounding."""
         return q.ravel()
-
-    def update_matrix(self) -> None:
-        """Make the matrix for the present blocks."""
-        super().update(self._barrier, None, self.symmetric)
 
 
 class BodyForm:
@@ -189,10 +196,16 @@ class BodyForm:
             self._places = self.operator.entries().places(self.problem.point)
         return self._places
 
-    def stiff_part(self, least: float) -> PETSc.Mat:
-        """K without blocks below ``least`` (`BodyMatrix.stiff_part`), in scalar rows: a new Mat, which the caller
-        destroys."""
-        return self.operator.entries().stiff_mat(least, self.symmetric)
+    @property
+    def factored_by(self) -> Options:
+        return FRONTS if self.symmetric else DIRECT[False]
+
+    @contextmanager
+    def to_factor(self, least: float) -> Iterator[Source]:
+        """K without blocks below ``least`` (`BodyMatrix.stiff_part`), in scalar rows."""
+        part = self.operator.entries().stiff_mat(least, self.symmetric)
+        yield part
+        part.destroy()  # the KSP keeps it
 
     def fronts(self, least: float, precision: type[np.floating]) -> Fronts:
         """The factors of this part, which is symmetric; all of a problem in the order of the first. Collective."""
@@ -223,4 +236,4 @@ class BodyForm:
         self.operator.destroy()
 
 
-NewtonForm = Union[ContactForm, BodyForm]
+System = Union[ContactForm, BodyForm]

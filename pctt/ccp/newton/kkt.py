@@ -61,7 +61,7 @@ class KKTForm(ContactForm):
         self.constraints = 0  # of a contact, of the present matrix
 
     @cached_property
-    def matrix(self) -> PETSc.Mat:
+    def _mat(self) -> PETSc.Mat:
         nc, size, _ = self._local.shape
         return symmetric_shell(self.problem.comm, nc * size, size, self._product, self._transposed)
 
@@ -77,9 +77,11 @@ class KKTForm(ContactForm):
         self._local[:, :3, 3:] = along.transpose(0, 2, 1)
         self._local[:, 3:, :3] = -(kkt.lam * self.row)[:, :, None] * kkt.df
         self._local[:, 3:, 3:] = np.eye(k)
-        self._blocks, self._made = self._local.copy(), False
-        self._blocks[:, :3, :3] = kkt.M + self.problem.diagonal_blocks
-        set_diagonal_blocks(self.matrix, self._blocks, symmetric=False)
+        self.blocks, self._made, self._current = self._local.copy(), False, False
+        self.blocks[:, :3, :3] = kkt.M + self.problem.diagonal_blocks
+
+    def _take_values(self) -> None:
+        set_diagonal_blocks(self._mat, self.blocks, symmetric=False)
 
     def _product(self, x: Array, out: Array) -> None:
         self._multiply(self._local, x, out)
