@@ -125,10 +125,16 @@ class ConeProblem:
         given = self._given_r[:, : self._width]
         words = door.wrong_velocities(r, given.shape)
         refuse(self.comm, words)
+        padded = door.padded(np.asarray(r, dtype=float).reshape(given.shape))
+        other = self.with_r(padded if self.units is None else self.units * padded)
+        other._given_r = padded
+        return other
+
+    def with_r(self, r: Array) -> ConeProblem:
+        """The same problem with other r (nc, 3) in the units of the cones; it shares all else."""
         other = copy.copy(self)
         other.__dict__.pop("N", None)
-        other._given_r = door.padded(np.asarray(r, dtype=float).reshape(given.shape))
-        other.r = other._given_r if self.units is None else self.units * other._given_r
+        other.r = r
         return other
 
     # -- the user's units ------------------------------------------------------------------------------------

@@ -32,6 +32,7 @@ from dem.compiled import inlined, loop
 
 Array = NDArray[np.float64]
 TINY = float(np.finfo(float).tiny)
+HELD = 1e12  # stiffness of what is held, over that of normal impulses: the block keeps its digits
 LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
 ROUND = 1e-14  # tangential part of a unit scaling point below which it has no direction
 
@@ -86,7 +87,7 @@ class LorentzForm:
 
     def barriers(self, root: Array, size: Array, u: Array, least: float, more: Array) -> Array:
         """B (count, width, width), with ``more`` (count, width) on its diagonal; what the problem does not have is held
-        by at least 1e12 times ``least``."""
+        by at least HELD times ``least``."""
         B = np.zeros((self.count, self.width, self.width))
         _barriers(root, size, u, self.weight.ravel(), self.live.ravel(), self.place, least, more, B)
         return B
@@ -263,7 +264,7 @@ def _barriers(root, size, u, weight, live, place, least, more, B):
                             B[c, m, place[i // count, b]] += 2.0 * across * h[a] * h[b]
         for m in range(1, B.shape[1]):
             if B[c, m, m] == 0.0:
-                B[c, m, m] = 1e12 * max(B[c, 0, 0], least)
+                B[c, m, m] = HELD * max(B[c, 0, 0], least)
         for m in range(B.shape[1]):
             B[c, m, m] += more[c, m]
 

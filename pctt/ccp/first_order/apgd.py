@@ -29,6 +29,9 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.options import number
 
+IMPATIENT = 300  # iterations without progress in single precision: double precision takes over
+NEAR = 1e-4  # residual below which slow chains of force are left
+
 
 @dataclass(frozen=True)
 class APGD(FirstOrder):
@@ -40,7 +43,7 @@ class APGD(FirstOrder):
     decay: float = number(0.99, "factor on L after each step, so that steps grow again where the curvature allows it")
     theta: float = number(0.2, "where momentum begins: below 1, as steps are short for most directions of descent")
     damping: float = number(0.05, "Coulomb's law: 1 - the greatest momentum; docs/notebook_ccp.md has trials")
-    near: float = number(0.03, "the same below a residual of 1e-4, where slow chains of force are left")
+    near: float = number(0.03, "the same below the residual NEAR, where slow chains of force are left")
     growth: float = number(6.0, "Coulomb's law: of a squared step over the least one, where momentum begins anew")
     single: float = number(
         3e-4,
@@ -58,7 +61,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: APGD, cou
     progress = None
     if problem.contact_map is not None:
         rough = limits.to(max(limits.tol, options.single / np.sqrt(max(problem.size, 1))))
-        impatient = replace(options, patience=min(options.patience, 300))  # double precision takes over
+        impatient = replace(options, patience=min(options.patience, IMPATIENT))
         progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, impatient)
         rough_impulse = _descend(progress, guess, options)
         if progress.best <= limits.aimed:
@@ -101,6 +104,6 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
             last_theta, theta = theta, theta * (np.sqrt(theta**2 + 4) - theta) / 2
             beta, least = last_theta * (1 - last_theta) / (last_theta**2 + theta), min(least, step)
             if coulomb:
-                beta = min(beta, 1 - (options.near if progress.best < 1e-4 else options.damping))
+                beta = min(beta, 1 - (options.near if progress.best < NEAR else options.damping))
         last, now, new = now, new, last
         lipschitz *= options.decay

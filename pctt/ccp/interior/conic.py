@@ -44,6 +44,8 @@ from pctt.ccp.unbounded import why_unbounded
 from pctt.log import phase
 from pctt.options import number
 
+LESS, HALF = 0.9, 0.5  # of the least residual, and of the last complementarity, that count as progress
+
 
 @dataclass(frozen=True)
 class Conic:
@@ -82,7 +84,8 @@ def solve(
         unbounded = bool(why_unbounded(given, found.g, found.y))
         if unbounded or history[-1] == min(history):
             best = found.g
-        waited = 0 if found.errors.natural <= 0.9 * least or gap <= 0.5 * last_gap else waited + 1
+        progress = found.errors.natural <= LESS * least or gap <= HALF * last_gap
+        waited = 0 if progress else waited + 1
         least, last_gap = min(found.errors.natural, least), gap
         done = history[-1] <= limits.aimed or unbounded
         if done or len(history) > limits.max_it or waited > options.patience:

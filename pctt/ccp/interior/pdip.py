@@ -32,6 +32,8 @@ from pctt.ccp.result import Limits, Result, Status
 from pctt.log import phase
 from pctt.options import FRACTION, number, option
 
+#: Steps after which the proximal term grows or shrinks by the factor; it is at most the factor.
+SHORT, LONG, FACTOR = 0.3, 0.7, 4.0
 PERSPECTIVE, PAPER = FORMS = ("perspective", "paper")
 
 
@@ -277,6 +279,6 @@ def _next_damping(damping: float, step: float, natural: float, options: PDIP) ->
     is less than the natural residual shows. Early, impulses may have to grow by orders of magnitude: there is none."""
     if natural > options.late:
         return 0.0
-    if step < 0.3:
-        return min(max(1.0, 4.0 * damping), 4.0)
-    return damping / 4.0 if step > 0.7 else damping
+    if step < SHORT:
+        return min(max(1.0, FACTOR * damping), FACTOR)
+    return damping / FACTOR if step > LONG else damping

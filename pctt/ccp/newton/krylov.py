@@ -225,9 +225,13 @@ class Krylov:
     @property
     def own(self) -> Telling | None:
         """The preconditioner, if it is one that tells of itself."""
+        return self._context if isinstance(self._context, Telling) else None
+
+    @property
+    def _context(self) -> Any:
+        """The object of Python that is the preconditioner, or None."""
         pc = self.ksp.pc
-        context = pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
-        return context if isinstance(context, Telling) else None
+        return pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
 
     def report(self) -> list[str]:
         """What a preconditioner that is `Telling` says of itself and its fallbacks, as in ``-ksp_view``."""
@@ -241,10 +245,12 @@ class Krylov:
 
     def words(self) -> str:
         """Krylov method and preconditioner."""
-        own, right = self.own, self.ksp.getPCSide() == PETSc.PC.Side.RIGHT
+        own, right, name = self.own, self.ksp.getPCSide() == PETSc.PC.Side.RIGHT, self._pc_name
+        if (context := self._context) is not None:  # the class as -pc_python_type has it
+            name = own.name if own else f"{type(context).__module__}.{type(context).__qualname__}"
         remark = f" {WITHIN}" if not own and self.what() else ""
         method = _NAMES.get(self.method, self.method) + " (right)" * right
-        return f"{method}, {own.name if own else self._pc_name}{remark}"
+        return f"{method}, {name}{remark}"
 
     def _now(self) -> float:
         if self.timed and self.comm.size > 1:
