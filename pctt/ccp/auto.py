@@ -46,7 +46,7 @@ class Auto:
     """Settings of `auto`."""
 
     patience: float = number(25.0, "APGD's iterations per digit of the tolerance and cube root of the contacts")
-    few: float = number(6.0, "APGD's iterations per digit where contacts are few (`pctt.ccp.newton.few`): 1/2 `conic`")
+    few: float = number(6.0, "APGD's iterations per digit of few contacts (`newton.elimination`): 1/2 `conic`")
     law: float = number(5.0, "factor on it for Coulomb's law: more systems, and unsymmetric; docs/notebook_ccp.md")
     start: float = number(3e4, "complementarity of the conic method's start, at most, by APGD's residual")
     basin: float = number(3e-4, "Coulomb residual at which the conic method's path is near enough for APGD")
@@ -65,7 +65,7 @@ def solve(
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
     tried = Attempts(problem, limits, newton, coulomb)
-    few, small = newton.has_few(problem), problem.size <= by_elimination.FEW
+    few, small = newton.has_elimination(problem), problem.size <= by_elimination.FEW
     begun = min(limits.max_it, problem.comm.bcast(options.iterations(problem.size, limits.tol, coulomb, few)))
     first = tried.apgd(guess, begun)
     if first.converged and first.residual > limits.aimed:

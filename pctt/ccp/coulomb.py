@@ -56,7 +56,7 @@ def fixed_point(
         g, spent = inner.impulse, [inner]
         y = problem.product(g) + r
         history.append(limits.residual(problem.errors(g, y, coulomb=True)))
-        limits.tell(inner.iterations, history[-1])
+        limits.report(inner.iterations, history[-1])
         best = inner if history[-1] <= min(history) else best
         failed = 0 if inner.converged else failed + 1
         if history[-1] <= tol or failed > 1 or inner.status is Status.UNBOUNDED:

@@ -39,11 +39,11 @@ class Recorder(ccp.Newton):
         self._new: np.ndarray | None = barrier.copy()
         super().update(barrier, *more, **named)
 
-    def solve(self, q: np.ndarray, *more: Any, **named: Any) -> tuple[np.ndarray, np.ndarray]:
+    def step(self, r_g: np.ndarray, r_lam: np.ndarray, *more: Any, **named: Any) -> tuple[np.ndarray, ...]:
         if self._new is not None:
-            self.systems.append(System(self._new, q.ravel().copy()))
+            self.systems.append(System(self._new, self.kkt.reduced(r_g, r_lam).ravel()))
             self._new = None
-        return super().solve(q, *more, **named)
+        return super().step(r_g, r_lam, *more, **named)
 
 
 class Replay:

@@ -17,10 +17,9 @@ from pctt import ccp, memory
 from pctt.blocks import Shell
 from pctt.ccp import delassus, newton_for
 from pctt.ccp.interior.pdip import PDIP
-from pctt.ccp.newton import by_elimination
+from pctt.ccp.newton import by_elimination, elimination
 from pctt.ccp.newton import factor as factors
-from pctt.ccp.newton import few as elimination
-from pctt.ccp.newton.few import Factors, ordered
+from pctt.ccp.newton.elimination import Factors, ordered
 from pctt.ccp.newton.forms import BodyForm, ContactForm
 from pctt.ccp.newton.kkt import KKT
 
@@ -45,7 +44,7 @@ def barrier_and_side(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("many", [20, 1000])
 def test_the_forms_agree_with_dense_algebra(form, many, monkeypatch):
     """Also where a body, here one that half of the contacts touch, has more contacts than N is filled with."""
-    monkeypatch.setattr(delassus, "HUB", many)
+    monkeypatch.setattr(delassus, "DENSE", many)
     comm, contacts, bodies, e = MPI.COMM_WORLD, 120, 30, 1e-2
     graph = random_graph(0, contacts, bodies, hub=True)
     G, here, own = graph.dense(), part(comm, contacts), part(comm, bodies)
@@ -64,7 +63,7 @@ def test_the_forms_agree_with_dense_algebra(form, many, monkeypatch):
     np.testing.assert_allclose(dv, ((G.T @ exact).reshape(-1, 6) - momenta)[own], rtol=0, atol=1e-6)
     np.testing.assert_allclose(problem.product(q[here]), (N @ q.ravel()).reshape(-1, 3)[here], rtol=0, atol=1e-6)
     assert newton.linear.fallbacks == 0
-    assert problem.has_hubs == (many == 20)
+    assert problem.has_dense_columns == (many == 20)
     newton.destroy()
 
 
@@ -155,7 +154,7 @@ def dense_kkt(N: np.ndarray, kkt: KKT) -> np.ndarray:
 @pytest.mark.parametrize(("each", "many"), [(1, 1000), (2, 1000), (2, 20)])
 def test_all_forms_give_the_step_of_the_matrix_with_multipliers(form, each, many, monkeypatch, database):
     """Also where a body has more contacts than N is filled with, and for a second problem of the same contacts."""
-    monkeypatch.setattr(delassus, "HUB", many)
+    monkeypatch.setattr(delassus, "DENSE", many)
     database["ksp_max_it"] = 5000
     comm, contacts, bodies, e = MPI.COMM_WORLD, 60, 20, 1e-2
     graph, here = random_graph(0, contacts, bodies, hub=True), part(comm, contacts)
@@ -221,7 +220,7 @@ def test_methods_without_multipliers_refuse_them_as_unknowns():
 
 
 def test_few_contacts_are_never_kept_apart():
-    G, some = delassus.without_hubs(SELF, from_graph(*heap(3)).contact_map.given)
+    G, some = delassus.without_dense_columns(SELF, from_graph(*heap(3)).contact_map.given)
     assert not some
     assert G.rows == 40
 
@@ -289,13 +288,13 @@ def test_few_contacts_get_factors_by_blocks(symmetric):
 def test_contacts_that_would_fill_the_factors_are_not_few(monkeypatch):
     """The same where a body touches too many of them for their matrix to be made."""
     newton = ccp.Newton(SELF, "body")
-    assert newton.has_few(from_graph(*heap(3, hub=True)))
+    assert newton.has_elimination(from_graph(*heap(3, hub=True)))
     monkeypatch.setattr(elimination, "LEAST", 1)
     for pairs, rest in ((10, 40), (300, 40), (10**6, 5)):
         monkeypatch.setattr(by_elimination, "PAIRS", pairs)
         monkeypatch.setattr(by_elimination, "REST", rest)
         problem = from_graph(*heap(3, hub=True))
-        assert not newton.has_few(problem)
+        assert not newton.has_elimination(problem)
         assert newton.begin(problem) is problem
     newton.destroy()
 

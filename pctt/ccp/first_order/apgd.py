@@ -7,7 +7,7 @@ line search is a Rayleigh quotient.
 N is applied once per iteration, in two halves. The first gives the velocities of the contacts at the extrapolated point
 from the images of the last two iterates, their momenta on the bodies. The second gives the image of the new point, and
 with it the curvature along the step, so a step that is repeated costs half. In single precision a contact moves 92
-bytes in the first half, 64 in the step, 80 in the second: 236, and none while it sleeps.
+bytes in the first half, 64 in the step, 80 in the second: 236, and none outside the active set.
 
 For Coulomb's law the De Saxce term mu |y_t| of the present gradient is added to it in every iteration. Then the law is
 the fixed point of the projected step, and one run finds it. But that step is no gradient step: the term is not the
@@ -78,18 +78,18 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     scaled, coulomb = progress.problem, progress.problem.coulomb
     now = scaled.iterate(scaled.start(guess))
     last, new, y = now.copy(), now.copy(), np.empty_like(now.x)
-    lipschitz, awake = options.lipschitz, True
+    lipschitz, whole = options.lipschitz, True
     theta, beta, step, least = options.theta, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, its least since beta = 0
     while True:
         if progress.is_due(math.sqrt(step)):
-            now, last, new, y = scaled.wake(now, last, new)
+            now, last, new, y = scaled.restore(now, last, new)
             if not progress.goes_on(now.x, scaled.look(now, y)):
                 return progress.impulse
-            awake = True
+            whole = True
         scaled.rigid_gradient(now, last, beta, y)  # at z = x + beta (x - last_x)
-        if awake and step > 0:
-            now, last, new, y = scaled.fall_asleep(now, last, new, y, math.sqrt(step))
-            awake = False
+        if whole and step > 0:
+            now, last, new, y = scaled.restrict(now, last, new, y, math.sqrt(step))
+            whole = False
         while True:
             curvature, length, uphill = scaled.step(now, last, beta, y, 1 / lipschitz, new)
             progress.iterations += 1

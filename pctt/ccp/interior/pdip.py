@@ -122,7 +122,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         # residuals
         errors = problem.errors(at.g, at.y)
         history.append(limits.residual(errors))
-        limits.tell(iteration, history[-1])
+        limits.report(iteration, history[-1])
         if history[-1] <= limits.tol:
             status, reason = Status.CONVERGED, limits.met
             break

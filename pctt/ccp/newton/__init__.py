@@ -27,8 +27,8 @@ from pctt.ccp.newton.by_factors import ByFactors
 from pctt.ccp.newton.by_ksp import ByKSP
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.defaults import DEFAULTS, GIVEN
+from pctt.ccp.newton.elimination import Order
 from pctt.ccp.newton.factor import Room
-from pctt.ccp.newton.few import Order
 from pctt.ccp.newton.forms import BodyForm, ContactForm, GivenForm, System
 from pctt.ccp.newton.kkt import KKT, KKTForm
 from pctt.ccp.problem import ConeProblem
@@ -42,7 +42,7 @@ _ASKED = {OWN + "pc_type", OWN + "ksp_type"}  # options that say how a system is
 
 
 class Newton:
-    """The Newton systems of one cone problem after another.
+    """A `Newton` object makes and solves the Newton systems of one cone problem after another.
 
     form : of FORMS. The body form has its own solver unless the options name a KSP or PC; a problem of few contacts, or
         one that knows no bodies (given by N), is solved in the form `contact` instead, by factors.
@@ -50,10 +50,12 @@ class Newton:
     Attributes
     ----------
     system : the present problem's, not there before the first
+    kkt : the last one of `linearise`
     linear : what solves it: `ByKSP`, `ByFactors` or `ByElimination`
     """
 
     system: System
+    kkt: KKT
 
     def __init__(self, comm: MPI.Comm, form: str = "contact", compare: Comparison | None = None):
         self.comm, self.form, self.compare, self._room = comm, form, compare, Room(comm)
@@ -97,7 +99,7 @@ class Newton:
         assert self._linear is not None
         return self._linear
 
-    def has_few(self, problem: ConeProblem) -> bool:
+    def has_elimination(self, problem: ConeProblem) -> bool:
         """Whether the systems of this problem are solved by elimination."""
         return self._few(problem.by_rows()) is not None
 
@@ -149,15 +151,15 @@ class Newton:
 
     def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
         """Set the barrier blocks B (nc, 3, 3). A caller that has (B + C)^-1 more accurately than by inversion passes it
-        as ``inverse``; a system that `mends` needs no B then. Only a linear solver that `takes_unsymmetric` accepts
-        blocks that are not ``symmetric``."""
+        as ``inverse``; a system with `error_in_momenta` needs no B then. Only a linear solver that `takes_unsymmetric`
+        accepts blocks that are not ``symmetric``."""
         with phase("CCPUpdate"):
             self.system.update(barrier, inverse, symmetric)
             self.linear.factor(self.system)
 
     def linearise(self, kkt: KKT) -> None:
         """Set the Newton matrix of a method with constraints and multipliers. Forms other than `kkt` eliminate them."""
-        self._kkt = kkt
+        self.kkt = kkt
         if not isinstance(self.system, KKTForm):
             self.update(kkt.schur())
             return
@@ -177,10 +179,10 @@ class Newton:
             if isinstance(system, KKTForm):
                 x = self.linear.solve(system.right_side(r_g, r_lam), tol, earlier)
                 return (*system.changes(x), x)
-            q = self._kkt.reduced(r_g, r_lam)
+            q = self.kkt.reduced(r_g, r_lam)
             x = self.linear.solve(system.right_hand_side(q, None, None), tol / system.speed, earlier)
             dg = system.impulses(x, q, None)
-            return dg, self._kkt.multipliers(dg, r_lam), x
+            return dg, self.kkt.multipliers(dg, r_lam), x
 
     def solve(
         self,

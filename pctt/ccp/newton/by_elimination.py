@@ -12,8 +12,8 @@ from pctt.ccp.cones import Array
 from pctt.ccp.delassus import GivenMatrix, all_blocks
 from pctt.ccp.newton.by_ksp import ByKSP
 from pctt.ccp.newton.defaults import GIVEN
+from pctt.ccp.newton.elimination import Factors, Order, ordered
 from pctt.ccp.newton.factor import Room
-from pctt.ccp.newton.few import Factors, Order, ordered
 from pctt.ccp.newton.forms import ContactForm, System
 from pctt.ccp.problem import ConeProblem
 

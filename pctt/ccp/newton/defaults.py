@@ -18,7 +18,7 @@ INCOMPLETE: Options = {"pc_type": "python", "pc_python_type": "pctt.pc.BlockICC"
 _FACTORS: Options = {"ksp_type": "gmres", "ksp_gmres_restart": "60", "ksp_max_it": "60"}
 DIRECT = {True: {**_FACTORS, "pc_type": "cholesky"}, False: {**_FACTORS, "pc_type": "lu"}}
 #: our own factors of the part of a symmetric K that is worth it
-FRONTS: Options = {
+MULTIFRONTAL: Options = {
     **_FACTORS, "ksp_type": "cg", "ksp_norm_type": "unpreconditioned",
-    "pc_type": "python", "pc_python_type": "pctt.ccp.newton.fronts.FrontPC",
+    "pc_type": "python", "pc_python_type": "pctt.ccp.newton.multifrontal.MultifrontalPC",
 }  # fmt: skip

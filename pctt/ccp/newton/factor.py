@@ -12,8 +12,8 @@ from petsc4py import PETSc
 
 from pctt import memory
 from pctt.ccp.newton.forms import System
-from pctt.ccp.newton.fronts import FrontPC
 from pctt.ccp.newton.krylov import Krylov, Solve
+from pctt.ccp.newton.multifrontal import MultifrontalPC
 from pctt.ksp_options import OWN
 
 #: Drop tolerance of a factor [mass]: entries of a block between bodies that it is better off without.
@@ -86,7 +86,7 @@ class Factor:
             self._made[kind] = Krylov(self.comm, OWN + "fallback_", options)
         solver = self._made[kind]
         context = solver.ksp.pc.getPythonContext() if solver.kind == "python" else None
-        if isinstance(context, FrontPC):
+        if isinstance(context, MultifrontalPC):
             return self._by_fronts(solver, context, system, b, x, rtol)
         if not self._factored:
             solver.forget()  # first, as its memory counts as taken
@@ -98,7 +98,7 @@ class Factor:
         return done, done.iterations
 
     def _by_fronts(
-        self, solver: Krylov, context: FrontPC, system: Any, b: PETSc.Vec, x: PETSc.Vec, rtol: float
+        self, solver: Krylov, context: MultifrontalPC, system: Any, b: PETSc.Vec, x: PETSc.Vec, rtol: float
     ) -> tuple[Solve | None, int]:
         """Of single precision, until they take many iterations."""
         count = 0

@@ -4,8 +4,9 @@ barrier blocks after another. Both have
     problem : the cone problem
     matrix : the system's matrix, a function; it is positive definite where it is symmetric
     symmetric : whether the present matrix is
-    mends : whether the residual of a solve is one of momenta, dv = G' dg - r_v, which the next step of a method with
-        momenta of its own mends; or it is one of velocities, (B + C) dg + G dv = q, where it opens what should touch
+    error_in_momenta : whether the residual of a solve is one of momenta, dv = G' dg - r_v, which the next step of a
+        method with momenta of its own mends; or it is one of velocities, (B + C) dg + G dv = q, where it opens what
+        should touch
     speed : what a residual of 1 changes the velocities of contacts by, about
 
 and the functions of `ContactForm`. `GivenForm` is that of contacts without bodies, and `pctt.ccp.newton.kkt.KKTForm`
@@ -26,9 +27,9 @@ from dem.contact_map.loops import local_product, pack
 from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.ccp.cones import Array
-from pctt.ccp.newton.defaults import DIRECT, FRONTS, Options
-from pctt.ccp.newton.fronts import Dissection, Fronts
+from pctt.ccp.newton.defaults import DIRECT, MULTIFRONTAL, Options
 from pctt.ccp.newton.krylov import Source
+from pctt.ccp.newton.multifrontal import Dissection, MultifrontalFactors
 from pctt.ccp.problem import ConeProblem
 
 
@@ -43,7 +44,7 @@ class ContactForm:
     with the full diagonal blocks.
     """
 
-    mends = False
+    error_in_momenta = False
     speed = 1.0
 
     def __init__(self, problem: ConeProblem):
@@ -86,7 +87,7 @@ class ContactForm:
         self.problem.operator.add_delassus(g, out)
 
     def entries(self) -> PETSc.Mat:
-        """S without the columns of hubs (BAIJ), with the places and names of the contacts that preconditioners may have
+        """S without dense columns of G (BAIJ), with the places and names of the contacts that preconditioners may have
         as attributes; collective."""
         if self._entries is None or not self._loaded:
             self._entries = self._with_N(self._entries)
@@ -156,7 +157,7 @@ class BodyForm:
     For Coulomb's law (B + C)^-1 is not symmetric, and K is not either. With moments its blocks are (nc, 6, 6).
     """
 
-    mends = True
+    error_in_momenta = True
 
     def __init__(self, problem: ConeProblem):
         assert problem.contact_map is not None
@@ -198,7 +199,7 @@ class BodyForm:
 
     @property
     def factored_by(self) -> Options:
-        return FRONTS if self.symmetric else DIRECT[False]
+        return MULTIFRONTAL if self.symmetric else DIRECT[False]
 
     @contextmanager
     def to_factor(self, least: float) -> Iterator[Source]:
@@ -207,10 +208,10 @@ class BodyForm:
         yield part
         part.destroy()  # the KSP keeps it
 
-    def fronts(self, least: float, precision: type[np.floating]) -> Fronts:
+    def fronts(self, least: float, precision: type[np.floating]) -> MultifrontalFactors:
         """The factors of this part, which is symmetric; all of a problem in the order of the first. Collective."""
         part = self.operator.entries().stiff_part(least)
-        fronts = Fronts(self.problem.comm, part, self.places(), precision, self._dissection)
+        fronts = MultifrontalFactors(self.problem.comm, part, self.places(), precision, self._dissection)
         self._dissection = fronts.dissection
         return fronts
 

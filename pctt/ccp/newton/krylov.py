@@ -40,7 +40,7 @@ _REASONS = {
 
 
 @runtime_checkable
-class Telling(Protocol):
+class Reporting(Protocol):
     """A python preconditioner that tells of itself, as those of the project do: its name for ``-pc_python_type``, lines
     for ``-ksp_view``, and in a few words what it really was over its solves."""
 
@@ -66,7 +66,7 @@ class Solve:
 
 
 class Krylov:
-    """KSP with options prefix ``prefix``; ``defaults`` are PETSc options that the user's own replace.
+    """A Krylov method is a KSP with the options prefix ``prefix``; the user's options replace the ``defaults``.
 
     Without options: BiCGStab, preconditioned from the right by the inverses of the diagonal blocks, to a
     relative residual of ``rtol`` in at most 1000 iterations (the paper's cap). On several ranks ILU and ICC
@@ -223,9 +223,9 @@ class Krylov:
         return block_diagonal(P) if self.kind == "pbjacobi" else None
 
     @property
-    def own(self) -> Telling | None:
+    def own(self) -> Reporting | None:
         """The preconditioner, if it is one that tells of itself."""
-        return self._context if isinstance(self._context, Telling) else None
+        return self._context if isinstance(self._context, Reporting) else None
 
     @property
     def _context(self) -> Any:
@@ -234,7 +234,7 @@ class Krylov:
         return pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
 
     def report(self) -> list[str]:
-        """What a preconditioner that is `Telling` says of itself and its fallbacks, as in ``-ksp_view``."""
+        """What a preconditioner that is `Reporting` says of itself and its fallbacks, as in ``-ksp_view``."""
         return self.own.report() if self.own else []
 
     def what(self) -> str:
