@@ -10,7 +10,7 @@ from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from pctt.body_matrix import Part
-from pctt.ccp.newton import fronts
+from pctt.ccp.newton import multifrontal
 from pctt.ccp.newton.multifrontal import MultifrontalFactors, dissected, separated
 
 SELF = MPI.COMM_SELF
@@ -106,7 +106,7 @@ def test_separators_separate():
     assert sizes[-1] <= side**2
     front = np.empty(side**3, int)
     front[order] = np.repeat(np.arange(len(sizes)), sizes)
-    leaves = sizes[front[pairs]].max(axis=1) <= fronts.LEAF
+    leaves = sizes[front[pairs]].max(axis=1) <= multifrontal.LEAF
     assert np.count_nonzero(front[pairs[:, 0]] == front[pairs[:, 1]]) > 0
     assert leaves.any()
 
@@ -116,7 +116,7 @@ def test_a_separator_is_the_smallest_of_the_middle():
     subsets = ((np.arange(1 << 8)[:, None] >> np.arange(8)) & 1).astype(bool)
     for _ in range(20):
         place = (np.arange(12) + 0.5) / 12
-        middle = np.flatnonzero(np.abs(place - 0.5) <= fronts.BAND)
+        middle = np.flatnonzero(np.abs(place - 0.5) <= multifrontal.BAND)
         low, high = np.arange(middle[0]), np.arange(middle[-1] + 1, 12)
         pairs = np.sort(rng.integers(0, 12, (20, 2)), axis=1)
         ends = np.isin(pairs[:, 0], low) & np.isin(pairs[:, 1], high)  # no body of the middle keeps these apart

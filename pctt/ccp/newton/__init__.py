@@ -30,7 +30,8 @@ from pctt.ccp.newton.defaults import DEFAULTS, GIVEN
 from pctt.ccp.newton.elimination import Order
 from pctt.ccp.newton.factor import Room
 from pctt.ccp.newton.forms import BodyForm, ContactForm, GivenForm, System
-from pctt.ccp.newton.kkt import KKT, KKTForm
+from pctt.ccp.newton.kkt import KKT
+from pctt.ccp.newton.kkt_form import KKTForm
 from pctt.ccp.problem import ConeProblem
 from pctt.ksp_options import OWN
 from pctt.log import phase
@@ -50,12 +51,10 @@ class Newton:
     Attributes
     ----------
     system : the present problem's, not there before the first
-    kkt : the last one of `linearise`
     linear : what solves it: `ByKSP`, `ByFactors` or `ByElimination`
     """
 
     system: System
-    kkt: KKT
 
     def __init__(self, comm: MPI.Comm, form: str = "contact", compare: Comparison | None = None):
         self.comm, self.form, self.compare, self._room = comm, form, compare, Room(comm)
@@ -138,11 +137,8 @@ class Newton:
             self.system.load(self.problem)
         else:
             given = self.form == "body" and problem.contact_map is None
-            form = FORMS["contact" if given else self.form] if few is None else GivenForm
-            self._take(form(self.problem), structure)
-        if few is not None:
-            assert isinstance(self.linear, ByElimination)
-            self.linear.take(*few)
+            form = FORMS["contact" if given else self.form]
+            self._take(form(problem) if few is None else GivenForm(self.problem, few[1]), structure)
         return self.problem
 
     def _take(self, system: System, structure: tuple | None) -> None:
@@ -159,13 +155,9 @@ class Newton:
 
     def linearise(self, kkt: KKT) -> None:
         """Set the Newton matrix of a method with constraints and multipliers. Forms other than `kkt` eliminate them."""
-        self.kkt = kkt
-        if not isinstance(self.system, KKTForm):
-            self.update(kkt.schur())
-            return
         with phase("CCPUpdate"):
-            if self.system.constraints not in (0, kkt.f.shape[1]):  # those of another method
-                self._take(KKTForm(self.problem), self._structure)
+            if not self.system.fits(kkt):  # those of another method
+                self._take(FORMS[self.form](self.problem), self._structure)
             self.system.linearise(kkt)
             self.linear.factor(self.system)
 
@@ -174,15 +166,9 @@ class Newton:
     ) -> tuple[Array, Array, Array]:
         """dg (nc, 3), dlam (nc, k) and the system's solution x for the right-hand side r_g (nc, 3), r_lam (nc, k) of
         `KKT`, to a residual of ``tol`` as in `solve`."""
-        system = self.system
         with phase("CCPKrylov"):
-            if isinstance(system, KKTForm):
-                x = self.linear.solve(system.right_side(r_g, r_lam), tol, earlier)
-                return (*system.changes(x), x)
-            q = self.kkt.reduced(r_g, r_lam)
-            x = self.linear.solve(system.right_hand_side(q, None, None), tol / system.speed, earlier)
-            dg = system.impulses(x, q, None)
-            return dg, self.kkt.multipliers(dg, r_lam), x
+            x = self.linear.solve(self.system.right_side(r_g, r_lam), tol / self.system.speed, earlier)
+            return (*self.system.changes(x, r_lam), x)
 
     def solve(
         self,

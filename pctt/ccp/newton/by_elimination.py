@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -14,7 +15,6 @@ from pctt.ccp.newton.by_ksp import ByKSP
 from pctt.ccp.newton.defaults import GIVEN
 from pctt.ccp.newton.elimination import Factors, Order, ordered
 from pctt.ccp.newton.factor import Room
-from pctt.ccp.newton.forms import ContactForm, System
 from pctt.ccp.problem import ConeProblem
 
 FEW = 1000  # contacts up to which an order of elimination is looked for
@@ -55,15 +55,10 @@ class ByElimination:
         self.ksp.begin()
         self._solves = 0
 
-    def take(self, N: GivenMatrix, order: Order) -> None:
-        """The problem's N, and the order for it."""
-        self._N, self._order = N.local, order
-
-    def factor(self, system: System) -> None:
+    def factor(self, system: Any) -> None:
         """The system has new values."""
-        assert isinstance(system, ContactForm)
         self.system = system
-        self._factors = Factors(self._N, self._order, system.blocks, system.symmetric)
+        self._factors = Factors(system.N, system.order, system.blocks, system.symmetric)
 
     def solve(self, b: Array, wanted: float, earlier: Sequence[Array]) -> Array:
         x, count = self._factors.solve(b.reshape(-1, 3), max(wanted, 1e-14 * math.sqrt(b @ b)))

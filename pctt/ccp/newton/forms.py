@@ -15,25 +15,57 @@ has the multipliers as unknowns too.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Union
 
 import numpy as np
+import scipy.sparse as sp
 from petsc4py import PETSc
 
 from dem.contact_map.loops import local_product, pack
 from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.ccp.cones import Array
+from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.defaults import DIRECT, MULTIFRONTAL, Options
+from pctt.ccp.newton.elimination import Order
+from pctt.ccp.newton.kkt import KKT
 from pctt.ccp.newton.krylov import Source
 from pctt.ccp.newton.multifrontal import Dissection, MultifrontalFactors
 from pctt.ccp.problem import ConeProblem
 
 
-class ContactForm:
+class Form:
+    """A form makes the systems of a method with constraints and multipliers too (`pctt.ccp.newton.kkt.KKT`): it
+    eliminates the multipliers, unless it says otherwise."""
+
+    update: Callable[..., None]
+    right_hand_side: Callable[..., Array]
+    impulses: Callable[..., Array]
+
+    def fits(self, kkt: KKT) -> bool:
+        """Whether the matrix can take the values of these constraints."""
+        return True
+
+    def linearise(self, kkt: KKT) -> None:
+        """Make the matrix of a method with constraints."""
+        self.kkt = kkt
+        self.update(kkt.schur())
+
+    def right_side(self, r_g: Array, r_lam: Array) -> Array:
+        """Of the system for x, for the right-hand side r_g (nc, 3), r_lam (nc, k) of `KKT`."""
+        self._q = self.kkt.reduced(r_g, r_lam)
+        return self.right_hand_side(self._q, None, None)
+
+    def changes(self, x: Array, r_lam: Array) -> tuple[Array, Array]:
+        """dg and dlam of a solution for the last `right_side`."""
+        dg = self.impulses(x, self._q, None)
+        return dg, self.kkt.multipliers(dg, r_lam)
+
+
+class ContactForm(Form):
     """The Newton system of the contacts, S = N + C + B (3Nc x 3Nc, block size 3): the paper's Schur complement.
 
         S dg = q + G r_v,    dv = G' dg - r_v.
@@ -139,13 +171,23 @@ class ContactForm:
 
 
 class GivenForm(ContactForm):
-    """The form of the contacts of a problem that is given by N: its momenta are impulses, and r_v is rounding."""
+    """The form of few contacts, of a problem that is given by N: its momenta are impulses, and r_v is rounding. It has
+    an ``order`` of elimination."""
+
+    def __init__(self, problem: ConeProblem, order: Order):
+        super().__init__(problem)
+        assert isinstance(problem.operator, GivenMatrix)
+        self.order = order
+
+    @property
+    def N(self) -> sp.bsr_matrix:  # noqa: N802 - as in formulas
+        return self.problem.operator.local  # type: ignore[union-attr]
 
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
         return q.ravel()
 
 
-class BodyForm:
+class BodyForm(Form):
     """The Newton system of the bodies, K = I + G' (B + C)^-1 G (6M x 6M, block size 6), in mass-scaled velocities: the
     Schur complement of the bodies.
 
