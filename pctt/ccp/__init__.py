@@ -138,18 +138,18 @@ def _by(
         systems.check(problem)
     given = (options or method.options(), *([] if systems is None else [systems]))
 
-    def run(guess: Array, limits: Limits, **law: bool) -> Result:
-        return method.function(problem, guess, limits, *given, **law)
-
+    run = method.function
     try:
         with phase("CCPSolve"):
-            found = run(guess, limits, coulomb=True) if coulomb and method.has_law else None
+            found = run(problem, guess, limits, *given, coulomb=True) if coulomb and method.has_law else None
             # conic's own systems of Coulomb's law are those of bodies, or of few contacts
             if coulomb and (found is None or (found.status is Status.GIVEN_UP and problem.contact_map is None)):
-                result = fixed_point(run, problem, guess, limits)
+                result = fixed_point(lambda *convex: run(*convex, *given), problem, guess, limits)
             else:
-                result = found or run(guess, limits)
+                result = found or run(problem, guess, limits, *given)
                 result.law = law
+        if systems is not None and systems.linear.remark:
+            result.reason += f"; {systems.linear.remark}"
     finally:
         if own is not None:
             own.destroy()

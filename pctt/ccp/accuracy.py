@@ -20,7 +20,7 @@ ROUNDINGS = 8.0 * float(np.finfo(float).eps)
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Figures of an impulse g with velocities y = N g + r (see ``docs/accuracy.md``).
+    """The figures say how accurate an impulse g with velocities y = N g + r is (see ``docs/accuracy.md``).
 
     Attributes
     ----------

@@ -24,20 +24,20 @@ import numpy as np
 
 from pctt.ccp import gathered
 from pctt.ccp.cones import Array
-from pctt.ccp.coulomb import Coulomb, fixed_point
+from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
-from pctt.ccp.newton import Newton
-from pctt.ccp.newton.linear import Settings
+from pctt.ccp.newton import Newton, by_elimination
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.options import number
 
+CONIC_ITERATIONS = 60  # of the conic method at most, as in the registry
 USUAL = apgd.APGD()
 PLAIN = apgd.APGD(damping=1.0, near=1.0)  # without momentum
 SHORT = conic.Conic(start=1.0, boundary_with_law=0.5)
-TERMS = Coulomb(max_it=60, depth=2)
+TERMS = {"most": 60, "depth": 2}  # cone problems for given De Saxce terms, where all else has failed
 GROWN = 1e9  # of the impulses that the data suggest: no mass ratio that is solved asks for as much
 
 
@@ -46,7 +46,7 @@ class Auto:
     """Settings of `auto`."""
 
     patience: float = number(25.0, "APGD's iterations per digit of the tolerance and cube root of the contacts")
-    few: float = number(6.0, "APGD's iterations per digit where contacts are few (`pctt.ccp.newton.few`): 1/2 `conic`")
+    few: float = number(6.0, "APGD's iterations per digit of few contacts (`newton.elimination`): 1/2 `conic`")
     law: float = number(5.0, "factor on it for Coulomb's law: more systems, and unsymmetric; docs/notebook_ccp.md")
     start: float = number(3e4, "complementarity of the conic method's start, at most, by APGD's residual")
     basin: float = number(3e-4, "Coulomb residual at which the conic method's path is near enough for APGD")
@@ -65,7 +65,7 @@ def solve(
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
     tried = Attempts(problem, limits, newton, coulomb)
-    few, small = newton.has_few(problem), problem.size <= Settings.few
+    few, small = newton.has_elimination(problem), problem.size <= by_elimination.FEW
     begun = min(limits.max_it, problem.comm.bcast(options.iterations(problem.size, limits.tol, coulomb, few)))
     first = tried.apgd(guess, begun)
     if first.converged and first.residual > limits.aimed:
@@ -94,7 +94,7 @@ class Attempts:
         self.problem, self.limits, self.newton, self.coulomb = problem, limits, newton, coulomb
         self.all: list[Result] = []
         self.usual = problem.norm(problem.r) / problem.mean_diagonal  # the size of impulses that the data suggest
-        self.most = min(60, limits.max_it)  # iterations of the conic method
+        self.most = min(CONIC_ITERATIONS, limits.max_it)
 
     def keep(self, result: Result, solver: str) -> Result:
         """Note a result. Impulses of self-stress may grow in Coulomb's law until their rounding throws bodies away, and
@@ -150,15 +150,15 @@ class Attempts:
                 self.apgd(self.best.impulse, self.limits.max_it)
                 return
         problem = self.problem
-        by_conic = partial(conic.solve, problem, options=conic.Conic(), newton=self.newton)
+        by_conic = partial(conic.solve, options=conic.Conic(), newton=self.newton)
         limits = replace(self.rest, max_it=self.most)
-        relaxed = by_conic(guess=np.zeros_like(problem.r), limits=limits.unwatched)
+        relaxed = by_conic(problem, np.zeros_like(problem.r), limits.unwatched)
         if why := why_unbounded(problem, relaxed.impulse):
             self.keep(replace(relaxed, status=Status.UNBOUNDED, reason=f"of the relaxation, {why}"), "conic")
             return
         last = relaxed = replace(relaxed, status=Status.STALLED, residual=np.inf, reason="relaxation")
         if problem.cones.parts == 1:  # without moments, whose terms it does not have
-            last = fixed_point(lambda g, to: by_conic(guess=g, limits=to), problem, relaxed.impulse, limits, TERMS)
+            last = fixed_point(by_conic, problem, relaxed.impulse, limits, **TERMS)
             last.after(relaxed)
         self.keep(last, "conic").exhausted = True
 

@@ -13,66 +13,57 @@ Malick, "A formulation of the linear discrete Coulomb friction problem via conve
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from pctt.ccp.cones import Array, tangential
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import FIXED_POINT, Limits, Result, Status
-from pctt.options import number
 
-
-@dataclass(frozen=True)
-class Coulomb:
-    """Settings of `fixed_point`."""
-
-    max_it: int = number(200, "cone problems before the iteration gives up")
-    depth: int = number(5, "earlier points of Anderson's acceleration; docs/notebook_ccp.md compares 0 to 10")
-    inner: float = number(
-        0.3,
-        "accuracy of a cone problem, as a part of the Coulomb residual before it, or of the tolerance: more exact ones "
-        "cost iterations without saving a cone problem, less exact ones hide from Anderson what the term has changed",
-    )
-    restart: float = number(3.0, "growth of the residual over its best at which earlier points are forgotten")
+#: Cone problems before the iteration gives up.
+MOST = 200
+#: Earlier points of Anderson's acceleration; docs/notebook_ccp.md compares 0 to 10.
+DEPTH = 5
+#: Accuracy of a cone problem, as a part of the Coulomb residual before it, or of the tolerance: more exact ones cost
+#: iterations without saving a cone problem, less exact ones hide from Anderson what the term has changed.
+INNER = 0.3
+#: Growth of the residual over its best at which earlier points are forgotten.
+RESTART = 3.0
 
 
 def fixed_point(
-    convex: Callable[[Array, Limits], Result], problem: ConeProblem, guess: Array, limits: Limits,
-    options: Coulomb = Coulomb(),
+    convex: Callable[..., Result], problem: ConeProblem, guess: Array, limits: Limits, most: int = MOST,
+    depth: int = DEPTH,
 ) -> Result:  # fmt: skip
-    """Impulses that obey Coulomb's law; ``convex(guess, limits)`` solves the cone problem.
+    """The iteration finds impulses that obey Coulomb's law; ``convex(problem, guess, limits)`` solves a cone problem.
 
     The result's residual and history are those of Coulomb's law, one value per cone problem; its iterations are those
-    of all cone problems. ``problem.r`` is changed during the iteration and restored.
+    of all cone problems, of which there are at most ``most``.
     """
     # a lone contact that slides answers a term s by -gain s: the step leads to its fixed point at once
     N = problem.diagonal_blocks
     gain = problem.mu**2 * 0.5 * (N[:, 1, 1] + N[:, 2, 2]) / np.where(N[:, 0, 0] > 0, N[:, 0, 0], np.inf)
-    anderson = Anderson(problem, 1.0 / (1.0 + gain), options.depth)
+    anderson = Anderson(problem, 1.0 / (1.0 + gain), depth)
     r, g, tol = problem.r, guess, limits.tol
     s = problem.mu * tangential(problem.product(g) + r) if problem.norm(g) > 0 else np.zeros_like(problem.mu)
-    accuracy = max(1e-2, options.inner * tol)  # the first term is a guess
+    accuracy = max(1e-2, INNER * tol)  # the first term is a guess
     best, failed = Result(guess, Status.STALLED, "", np.inf, 0), 0
     history: list[float] = []
     spent: list[Result] = []
-    while len(history) < options.max_it:
-        problem.r = r + np.stack([s, 0 * s, 0 * s], axis=1)
-        try:
-            inner = convex(g, limits.to(accuracy).unwatched).after(*spent)
-        finally:
-            problem.r = r
+    while len(history) < most:
+        relaxed = problem.with_r(r + np.stack([s, 0 * s, 0 * s], axis=1))
+        inner = convex(relaxed, g, limits.to(accuracy).unwatched).after(*spent)
         g, spent = inner.impulse, [inner]
         y = problem.product(g) + r
         history.append(limits.residual(problem.errors(g, y, coulomb=True)))
-        limits.tell(inner.iterations, history[-1])
+        limits.report(inner.iterations, history[-1])
         best = inner if history[-1] <= min(history) else best
         failed = 0 if inner.converged else failed + 1
         if history[-1] <= tol or failed > 1 or inner.status is Status.UNBOUNDED:
             break
-        if history[-1] > options.restart * min(history):
+        if history[-1] > RESTART * min(history):
             anderson.forget()
-        accuracy = min(accuracy, options.inner * max(tol, history[-1]))
+        accuracy = min(accuracy, INNER * max(tol, history[-1]))
         s = np.maximum(anderson.next(s, problem.mu * tangential(y) - s), 0.0)
     least, count = min(history), len(history)
     status, words = Status.CONVERGED, "Coulomb residual below the tolerance"

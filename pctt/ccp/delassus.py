@@ -23,7 +23,7 @@ from dem.contact_map.map import checked, shaped
 from dem.exchange import exchange, offsets
 from pctt.blocks import Array, square_block_matrix
 
-HUB = 500  # a body with more contacts is a hub: its columns of G would fill N
+DENSE = 500  # contacts of a body beyond which its columns of G are dense, and would fill N
 
 
 def rows_of(mat: PETSc.Mat) -> sp.csr_matrix:
@@ -48,6 +48,8 @@ class GivenOperator:
     product : a function of impulses (nc, 3) that returns N g (nc, 3); collective
     blocks : (nc, 3, 3) the diagonal blocks of N
     """
+
+    has_parts = False
 
     def __init__(self, comm: MPI.Comm, blocks: Array, product: Callable[[Array], Array] | None = None):
         self.comm, self.rows, self._blocks, self._product = comm, len(blocks), blocks, product
@@ -245,13 +247,13 @@ class ColumnMap(BlockMap):
     """The map of a matrix whose columns are any unknowns of the mass one: six of them in a block."""
 
 
-def without_hubs(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, bool]:
-    """G without the columns of the bodies that have more than HUB contacts, and whether there are such. Collective."""
+def without_dense_columns(comm: MPI.Comm, G: BlockRows) -> tuple[BlockRows, bool]:
+    """G without the columns of the bodies with more than DENSE contacts, and whether there are such. Collective."""
     halo, body = find_halo(comm, G.columns, G.indices)
     count = np.bincount(body, minlength=halo.rows)
     halo.add(count)
     halo.update(count)
-    kept = count[body] <= HUB
+    kept = count[body] <= DENSE
     if not comm.allreduce(not kept.all(), MPI.LOR):
         return G, False
     before = np.concatenate([[0], np.cumsum(kept)])
@@ -291,7 +293,7 @@ def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
 
 
 def all_blocks(G: BlockRows) -> sp.bsr_matrix:
-    """N = G G' of a problem on one rank, hubs included."""
+    """N = G G' of a problem on one rank, dense columns included."""
     indptr, indices, blocks = _all_blocks(G.indptr, G.indices, np.ascontiguousarray(G.blocks), G.columns)
     return sp.bsr_matrix((blocks, indices, indptr), shape=(3 * G.rows,) * 2)
 

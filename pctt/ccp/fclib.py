@@ -31,7 +31,7 @@ from scipy.sparse.linalg import MatrixRankWarning, spsolve
 from dem.contact_map import BlockRows
 from pctt.blocks import square_block_matrix
 from pctt.ccp.cones import Array, Cones, FrictionCones, RollingCones
-from pctt.ccp.delassus import HUB, rows_in_blocks
+from pctt.ccp.delassus import DENSE, rows_in_blocks
 from pctt.ccp.problem import ConeProblem
 from pctt.disk import FileError, hdf5, refuse_links, whole
 
@@ -332,8 +332,8 @@ def write_local(
     """
     if problem.cones.parts > 1:
         raise ValueError(f"the problem has {problem.cones.what}, which is read but not written")
-    if problem.has_hubs:
-        raise ValueError(f"a body has more than {HUB} contacts and would fill N; allowed is fclib.write_global")
+    if problem.has_dense_columns:
+        raise ValueError(f"a body has more than {DENSE} contacts and would fill N; allowed is fclib.write_global")
     N = problem.rigid_matrix()
     W = _gathered(problem.comm, rows_in_blocks(N).tocsr())
     N.destroy()

@@ -1,7 +1,7 @@
 """A problem of few contacts that are on several ranks, whole on the first one.
 
-There its Newton systems have the factors of `pctt.ccp.newton.few`, which are those of one rank: a step of the conic
-method then takes as long as the messages of one product of all ranks."""
+There its Newton systems have the factors of `pctt.ccp.newton.elimination`, which are those of one rank: a step of the
+conic method then takes as long as the messages of one product of all ranks."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from dem.exchange import offsets
 from pctt.ccp.cones import Array
 from pctt.ccp.delassus import GivenMatrix, rows_in_blocks
 from pctt.ccp.interior import conic
-from pctt.ccp.newton import Newton
-from pctt.ccp.newton.linear import Settings
+from pctt.ccp.newton import Newton, by_elimination
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
 
 
 def takes(problem: ConeProblem, newton: Newton) -> bool:
     """Whether a problem has few contacts, on several ranks; the same on all."""
-    few = newton.takes_few and problem.comm.size > 1 and problem.size <= Settings.few
+    few = newton.own and problem.comm.size > 1 and problem.size <= by_elimination.FEW
     few = few and problem.has_entries and problem.cones.parts == 1
-    return few and not problem.by_rows().has_hubs
+    return few and not problem.by_rows().has_dense_columns
 
 
 def solve(
@@ -41,13 +40,13 @@ def solve(
         given = np.concatenate(r), np.concatenate(mu)
         whole = ConeProblem(MPI.COMM_SELF, *given, N=N, compliance=np.concatenate(soft)[:, :2])
         own = Newton(MPI.COMM_SELF, "body")
-        if own.has_few(whole):
+        if own.has_elimination(whole):
             found = conic.solve(whole, np.concatenate(start), limits.unwatched, options, own, coulomb=coulomb)
         own.destroy()
         whole.destroy()
     found = comm.bcast(found)
     for iteration, residual in enumerate(found.history):
-        limits.tell(iteration, residual)
+        limits.report(iteration, residual)
     if found.status is Status.GIVEN_UP:
         found.impulse = guess
     else:

@@ -15,7 +15,7 @@ from dem.contact_map import BlockRows
 from dem.exchange import reduced, refuse
 from pctt.ccp import door
 from pctt.ccp.cones import TINY, Array, Cones, FrictionCones
-from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, ritz_values, without_hubs
+from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, ritz_values, without_dense_columns
 
 
 class Errors(NamedTuple):
@@ -36,7 +36,7 @@ class Errors(NamedTuple):
 
 
 class ConeProblem:
-    """One step's cone problem, its contacts distributed over the ranks of ``comm``.
+    """A cone problem is that of one step, with its contacts distributed over the ranks of ``comm``.
 
     N = G M^-1 G' + C is given by the map G from velocities of unknowns to those of contacts, with the masses M of the
     unknowns, or directly (``N``). The compliance C is diagonal: contacts that yield a little, see `dem.stiffness`.
@@ -125,10 +125,16 @@ class ConeProblem:
         given = self._given_r[:, : self._width]
         words = door.wrong_velocities(r, given.shape)
         refuse(self.comm, words)
+        padded = door.padded(np.asarray(r, dtype=float).reshape(given.shape))
+        other = self.with_r(padded if self.units is None else self.units * padded)
+        other._given_r = padded
+        return other
+
+    def with_r(self, r: Array) -> ConeProblem:
+        """The same problem with other r (nc, 3) in the units of the cones; it shares all else."""
         other = copy.copy(self)
         other.__dict__.pop("N", None)
-        other._given_r = door.padded(np.asarray(r, dtype=float).reshape(given.shape))
-        other.r = other._given_r if self.units is None else self.units * other._given_r
+        other.r = r
         return other
 
     # -- the user's units ------------------------------------------------------------------------------------
@@ -189,7 +195,7 @@ class ConeProblem:
 
     @cached_property
     def N(self) -> PETSc.Mat:
-        """N as a Mat of block size 3 (BAIJ), without the columns of hubs; built at its first use and kept."""
+        """N as a Mat of block size 3 (BAIJ), without dense columns of G; built at its first use and kept."""
         N = self.rigid_matrix()
         if self.yields:
             diagonal = N.createVecLeft()
@@ -212,18 +218,18 @@ class ConeProblem:
         return self.contact_map is not None or isinstance(self.operator, GivenMatrix)
 
     @property
-    def has_hubs(self) -> bool:
-        """Whether some bodies have more than HUB contacts and would fill N: ``N`` is without their columns of G."""
+    def has_dense_columns(self) -> bool:
+        """Whether some bodies have more than DENSE contacts and would fill N: ``N`` is without their columns of G."""
         return self.contact_map is not None and self._split[1]
 
     @cached_property
     def _split(self) -> tuple[BlockRows, bool]:
         assert self.contact_map is not None
-        return without_hubs(self.comm, self.contact_map.block_rows)
+        return without_dense_columns(self.comm, self.contact_map.block_rows)
 
     @cached_property
     def diagonal_blocks(self) -> Array:
-        """The 3 x 3 diagonal blocks of N (nc, 3, 3), hubs and the compliance included."""
+        """The 3 x 3 diagonal blocks of N (nc, 3, 3), dense columns and the compliance included."""
         if not self.yields:
             return self._rigid_blocks
         blocks = self._rigid_blocks.copy()
@@ -233,7 +239,7 @@ class ConeProblem:
 
     @cached_property
     def diagonal(self) -> Array:
-        """The diagonal of N (nc, 3), hubs and the compliance included."""
+        """The diagonal of N (nc, 3), dense columns and the compliance included."""
         return _diagonals(self._rigid_blocks) + self.compliance
 
     @cached_property

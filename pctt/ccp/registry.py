@@ -55,7 +55,7 @@ SOLVERS = {
     for solver in (
         Solver("pdip", pdip.solve, pdip.PDIP, NEWTON, 200,
                "the paper's primal-dual interior point method", "the paper, section 2.4", has_multipliers=True),
-        Solver("conic", conic.solve, conic.Conic, NEWTON, 60,
+        Solver("conic", conic.solve, conic.Conic, NEWTON, auto.CONIC_ITERATIONS,
                "symmetric cone interior point method, Nesterov-Todd scaling, Mehrotra's corrector",
                "Nesterov, Todd 1997; Acary et al. 2023", has_law=True, cones=BOTH),
         Solver("auto", auto.solve, auto.Auto, EITHER, 20_000,

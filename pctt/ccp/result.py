@@ -27,7 +27,7 @@ ENOUGH = 1000.0  # accuracy of the natural residual, over the tolerance, at whic
 
 @dataclass(frozen=True)
 class Limits:
-    """When a solver stops; options of every solver: ``-ccp_tol``, ``-ccp_max_it`` and so on."""
+    """Limits say when a solver stops; they are options of every solver: ``-ccp_tol``, ``-ccp_max_it`` and so on."""
 
     tol: float = option(1e-4, "natural residual at which a cone problem counts as solved", check=FRACTION)
     max_it: int = option(
@@ -72,7 +72,7 @@ class Limits:
             above = f"closing speed {speed:.2g} m/s, above {self.closing_speed:g}"
         return f"squeezed: {above}, at a natural residual of {natural:.1e}, {ENOUGH:g} times below the tolerance"
 
-    def tell(self, iterations: int, residual: float) -> None:
+    def report(self, iterations: int, residual: float) -> None:
         """Tell who watches."""
         if self.watch is not None:
             self.watch(iterations, residual)
@@ -108,7 +108,7 @@ class Limits:
 
 
 class Status(Enum):
-    """How a solver ended; code looks at this, people at the ``reason`` beside it."""
+    """A status says how a solver ended; code looks at this, people at the ``reason`` beside it."""
 
     CONVERGED = "converged"
     SQUEEZED = "squeezed"  #: the natural residual is far below the tolerance, the closing work is not
@@ -129,7 +129,7 @@ class Counts(NamedTuple):
 
 @dataclass
 class Result:
-    """Impulses of a cone problem and how they were found.
+    """A result has the impulses of a cone problem, and says how they were found.
 
     Attributes
     ----------

@@ -16,9 +16,8 @@ from dem.compiled import set_threads
 from dem.experiment import Experiment
 from dem.together import together
 from pctt import ccp
-from pctt.ccp.newton import DEFAULTS
 from pctt.ccp.newton.compare import labelled, prefix
-from pctt.ccp.newton.linear import INCOMPLETE
+from pctt.ccp.newton.defaults import DEFAULTS, INCOMPLETE
 from pctt.ccp.registry import why_no_form
 from pctt.ksp_options import (
     OWN,

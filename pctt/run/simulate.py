@@ -68,7 +68,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     if settings.tol > report.LOOSE:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE_BECAUSE}")
     solver = ccp.SOLVERS[settings.solver]
-    if solver.newton and solver.has_law and settings.law == ccp.COULOMB and not newton.linear.own:
+    if solver.newton and solver.has_law and settings.law == ccp.COULOMB and not newton.own:
         progress.say(f"WARNING: {report.NOT_THE_LAW}")
     elif solver.newton:
         some = " of conic, for steps that apgd leaves to it" if settings.solver == "auto" else ""

@@ -29,7 +29,7 @@ from dem.scenes import Mixer
 from dem.unconstrained import unconstrained
 from dem.world import World
 from pctt import ccp
-from pctt.ccp.newton.fronts import Fronts
+from pctt.ccp.newton.multifrontal import MultifrontalFactors
 
 BODY = 6 * 4  # bytes of a body's velocity or momentum in single precision, which is that of `apgd` to 2e-6
 BOXES = 8 * 6 * 8  # bytes of the boxes of a rank
@@ -243,11 +243,11 @@ class Factors:
     """The operations of the Cholesky factors by fronts (of one rank) that are made while this is entered."""
 
     def __enter__(self) -> Factors:
-        self.operations, self._init = list[float](), Fronts.__init__
-        Fronts.__init__ = lambda *arguments: self._made(*arguments)  # type: ignore[assignment]
+        self.operations, self._init = list[float](), MultifrontalFactors.__init__
+        MultifrontalFactors.__init__ = lambda *arguments: self._made(*arguments)  # type: ignore[assignment]
         return self
 
-    def _made(self, fronts: Fronts, *arguments: Any) -> None:
+    def _made(self, fronts: MultifrontalFactors, *arguments: Any) -> None:
         self._init(fronts, *arguments)
         made = fronts.own + fronts.shared
         sizes = np.array([(front.diagonal.shape[0], front.below.shape[0]) for front in made], float)
@@ -255,7 +255,7 @@ class Factors:
         self.operations.append(float((own**3 / 3 + own**2 * rest + own * rest**2).sum()))
 
     def __exit__(self, *exception: object) -> None:
-        Fronts.__init__ = self._init  # type: ignore[method-assign]
+        MultifrontalFactors.__init__ = self._init  # type: ignore[method-assign]
 
 
 def seconds_of_messages() -> tuple[float, float]:

@@ -14,6 +14,7 @@ from dem.scenes import Mixer
 from pctt import ccp
 from pctt.ccp.interior.pdip import PDIP
 from pctt.ccp.newton.forms import ContactForm
+from pctt.ccp.newton.kkt import KKT
 
 COMM = MPI.COMM_SELF
 TOL = 1e-4  # natural residual at which the Newton systems end
@@ -35,15 +36,15 @@ class Recorder(ccp.Newton):
         self.systems: list[System] = []
         return super().begin(problem)
 
-    def update(self, barrier: np.ndarray, *more: Any, **named: Any) -> None:
-        self._new: np.ndarray | None = barrier.copy()
-        super().update(barrier, *more, **named)
+    def linearise(self, kkt: KKT) -> None:
+        self._new: KKT | None = kkt
+        super().linearise(kkt)
 
-    def solve(self, q: np.ndarray, *more: Any, **named: Any) -> tuple[np.ndarray, np.ndarray]:
+    def step(self, r_g: np.ndarray, r_lam: np.ndarray, *more: Any, **named: Any) -> tuple[np.ndarray, ...]:
         if self._new is not None:
-            self.systems.append(System(self._new, q.ravel().copy()))
+            self.systems.append(System(self._new.schur(), self._new.reduced(r_g, r_lam).ravel()))
             self._new = None
-        return super().solve(q, *more, **named)
+        return super().step(r_g, r_lam, *more, **named)
 
 
 class Replay:

@@ -11,7 +11,7 @@ from test_unbounded import squeezed
 from pctt import ccp
 from pctt.ccp import Limits, Status, auto
 from pctt.ccp.auto import Auto
-from pctt.ccp.newton.linear import Settings
+from pctt.ccp.newton import by_elimination
 
 DONE = "natural residual and closing work below the tolerance"
 
@@ -33,7 +33,7 @@ def test_auto_takes_apgd_where_it_is_quick():
 def test_auto_goes_over_to_conic_where_apgd_takes_long(law, contacts, tol, monkeypatch):
     """To the end; for Coulomb's law, where contacts are not few, to the end of its path, from where APGD goes on. All
     iterations are counted."""
-    monkeypatch.setattr(Settings, "few", 100)
+    monkeypatch.setattr(by_elimination, "FEW", 100)
     options, coulomb, few = Auto(few=1.0, patience=0.3), law == ccp.COULOMB, contacts == 40
     result = solve("auto", tol, options=options, law=law, contacts=contacts)
     begun = options.iterations(contacts, tol, coulomb, few=few)

@@ -11,8 +11,8 @@ from problems import SELF, Known, from_graph, from_matrix, heap, known_optimum, 
 from dem.contact_map import BlockRows
 from pctt import ccp, memory
 from pctt.ccp import ConeProblem, Limits, newton_for
+from pctt.ccp.newton import by_elimination
 from pctt.ccp.newton.krylov import Krylov
-from pctt.ccp.newton.linear import Settings
 
 FORMS = pytest.mark.parametrize("form", ["contact", "body"])
 CASES = {
@@ -29,7 +29,7 @@ CASES = {
 @pytest.fixture(autouse=True)
 def few(request, monkeypatch):
     """Contacts of the problems that get factors by blocks: none, unless a test says more."""
-    monkeypatch.setattr(Settings, "few", getattr(request, "param", 0))
+    monkeypatch.setattr(by_elimination, "FEW", getattr(request, "param", 0))
 
 
 def packing(side: int = 5, seed: int = 0) -> tuple[BlockRows, np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from several_ranks import alone
 from pctt import ccp
 from pctt.ccp import Limits, Status, fclib
 from pctt.ccp.cones.lorentz import determinant
-from pctt.ccp.coulomb import Coulomb, fixed_point
+from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.interior import conic
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "fclib"
@@ -28,10 +28,10 @@ def by_cone_problems(problem, tol=1e-8, guess=None, **options):
     """A sequence of cone problems, solved by APGD."""
     guess = np.zeros_like(problem.r) if guess is None else guess
 
-    def convex(guess, limits):
+    def convex(problem, guess, limits):
         return ccp.solve(problem, guess, "apgd", limits, law=ccp.RELAXATION)
 
-    return fixed_point(convex, problem, guess, Limits(tol), Coulomb(**options))
+    return fixed_point(convex, problem, guess, Limits(tol), **options)
 
 
 def newton_steps(problem, tol=1e-8, guess=None):
@@ -137,7 +137,7 @@ def test_acceleration_and_a_warm_start_save_cone_problems():
 def test_giving_up_is_said():
     problem = sliding_heap(0.8)
     r = problem.r.copy()
-    result = by_cone_problems(problem, tol=1e-9, max_it=3)
+    result = by_cone_problems(problem, tol=1e-9, most=3)
     assert not result.converged
     assert (result.cone_problems, len(result.history)) == (3, 3)
     assert result.reason == f"Coulomb's law not met: residual {min(result.history):.1e} at best in 3 cone problems"
@@ -181,12 +181,13 @@ def test_what_was_learnt_is_forgotten_when_the_residual_grows(growth, forgets):
     problem = ccp.ConeProblem(SELF, r.copy(), np.array([mu]), N=matrix(SELF, np.eye(3)))
     openings, answers = [], [1 + error for error in (0.1, 0.02, 0.02 * growth, 0.0)]
 
-    def convex(guess, limits):
-        openings.append(problem.r[0, 0] - r[0, 0])
+    def convex(relaxed, guess, limits):
+        openings.append(relaxed.r[0, 0] - r[0, 0])
+        assert np.array_equal(problem.r, r)
         g = answers[len(openings) - 1] * np.array([[1.0, -mu, 0.0]])
         return ccp.Result(g, Status.CONVERGED, "", 0.0, 1, 0, 0, [0.0])
 
-    result = fixed_point(convex, problem, np.zeros((1, 3)), Limits(1e-6), Coulomb())
+    result = fixed_point(convex, problem, np.zeros((1, 3)), Limits(1e-6))
     assert result.converged
     assert result.history[2] == pytest.approx(growth * result.history[1], rel=0.1)
     sliding = 3.0 - mu * answers[2]

@@ -490,10 +490,10 @@ def test_a_file_that_cannot_be_written_leaves_what_was_there(tmp_path, monkeypat
 @pytest.fixture
 def crowded(monkeypatch):
     """A problem with a body of 11 contacts and more, where N has a low-rank term, and its N."""
-    monkeypatch.setattr(delassus, "HUB", 10)
+    monkeypatch.setattr(delassus, "DENSE", 10)
     known, graph = heap(1, 30, 12, hub=True)
     problem = ConeProblem(SELF, known.r, known.mu, G=graph.part(SELF), compliance=1e-3)
-    assert problem.has_hubs
+    assert problem.has_dense_columns
     return problem, graph
 
 
@@ -505,7 +505,7 @@ def test_a_global_problem_with_a_crowded_body_is_the_same_when_read_again(tmp_pa
     matrices = sp.csr_matrix(ones), sp.csr_matrix(H.T)
     fclib.write_global(path, SELF, *matrices, zeros, problem.r, problem.mu, compliance=problem.compliance[:, 0])
     again = fclib.read(path, SELF)
-    assert again.has_hubs
+    assert again.has_dense_columns
     x = np.random.default_rng(0).normal(size=problem.r.shape)
     np.testing.assert_allclose(again.product(x), problem.product(x), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(again.diagonal_blocks, problem.diagonal_blocks, rtol=1e-12, atol=1e-12)

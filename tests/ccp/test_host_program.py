@@ -31,7 +31,7 @@ def set_all(database: PETSc.Options) -> None:
 @pytest.mark.parametrize("given_by_matrix", [False, True])
 @pytest.mark.parametrize("type", ["conic", "pdip"])
 def test_a_cone_problem_is_solved_as_without_them(type, given_by_matrix, database, capfd, monkeypatch):
-    monkeypatch.setattr("pctt.ccp.newton.linear.Settings.few", 0)  # else conic has no KSP here
+    monkeypatch.setattr("pctt.ccp.newton.by_elimination.FEW", 0)  # else conic has no KSP here
     known, graph = heap()
     problem = from_graph(known, graph)
     problem = problem.by_matrix(problem.operator) if given_by_matrix and hasattr(problem.operator, "local") else problem

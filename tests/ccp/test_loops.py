@@ -143,7 +143,7 @@ def test_sums_of_a_problem_from_its_cones():
         for one, other in zip(cones.errors(x, y, x, 0.3, coulomb), errors(x, y, x, 0.3, mu, coulomb, [])):
             np.testing.assert_allclose(one, other)
     open_ones = (x[:, 0] <= 0) & (y[:, 0] - term[:, 0] > 0.1)
-    assert np.array_equal(cones.not_idle(x, x, y, 0.1), ~open_ones)
+    assert np.array_equal(cones.active(x, x, y, 0.1), ~open_ones)
     sums, most = FrictionCones(np.zeros(0)).errors(x[:0], y[:0], x[:0], 0.3, True)
     assert most == 0.0
     assert not sums.any()
@@ -169,14 +169,14 @@ def test_blocks_of_cones_that_share_a_normal_number(rolls, coulomb, normal, tang
     mu = rng.uniform(0.05, 1.5, (3, count)) * (rng.random((3, count)) > 0.2)
     cones = RollingCones(*mu) if rolls else FrictionCones(mu[0])
     lorentz = cones.lorentz()
-    rows = len(lorentz.known)
-    A = np.stack([lorentz.of(e.reshape(rows, 3)).ravel() for e in np.eye(3 * rows)], axis=1)
-    known = np.diag(lorentz.known.ravel())
+    rows = len(lorentz.mask)
+    A = np.stack([lorentz.apply(e.reshape(rows, 3)).ravel() for e in np.eye(3 * rows)], axis=1)
+    known = np.diag(lorentz.mask.ravel())
     z = rng.normal(size=(lorentz.number * count, 3))
-    np.testing.assert_allclose(lorentz.back(z).ravel(), A.T @ z.ravel(), atol=1e-12)
+    np.testing.assert_allclose(lorentz.transpose(z).ravel(), A.T @ z.ravel(), atol=1e-12)
     g = known @ rng.normal(size=3 * rows)
     np.testing.assert_allclose(lorentz.impulses((A @ g).reshape(-1, 3)).ravel(), g, atol=1e-12)
-    np.testing.assert_allclose(lorentz.back(lorentz.spread(g.reshape(-1, 3))).ravel(), g, atol=1e-12)
+    np.testing.assert_allclose(lorentz.transpose(lorentz.right_inverse(g.reshape(-1, 3))).ravel(), g, atol=1e-12)
 
     there = np.abs(A).sum(axis=1).reshape(-1, 3) > 0
     s, z = (inside(rng, len(there)) * there for _ in range(2))
@@ -196,7 +196,7 @@ def test_blocks_of_cones_that_share_a_normal_number(rolls, coulomb, normal, tang
     C[:count] = np.stack([soft, along[0], along[0]], axis=1)
     if rolls:
         C[count:] = np.stack([along[2], along[1], along[1]], axis=1)
-    arrows = lorentz.arrows(*W.parts, u, soft, along.ravel())
+    arrow = lorentz.arrow(*W.parts, u, soft, along.ravel())
     barriers = lorentz.barriers(*W.parts, u, 1.0, np.zeros((count, lorentz.width)))
 
     def whole(blocks):
@@ -209,20 +209,20 @@ def test_blocks_of_cones_that_share_a_normal_number(rolls, coulomb, normal, tang
     size = np.abs(B).max()
     np.testing.assert_allclose(known @ whole(barriers) @ known / size, B / size, atol=1e-12)
     there = known.diagonal() > 0
-    X, system = whole(arrows.X), B + np.diag(C.ravel())
+    X, system = whole(arrow.X), B + np.diag(C.ravel())
     assert not X[~there].any()
     assert not X[:, ~there].any()
     X, system = X[np.ix_(there, there)], system[np.ix_(there, there)]
     assert np.abs(X @ system - np.eye(len(X))).max() <= 1e-12 * max(1.0, np.abs(X).max()) * np.abs(system).max()
 
     f, r = W.times(rng.normal(size=s.shape) * (np.abs(A).sum(axis=1).reshape(-1, 3) > 0)) - s, g.reshape(-1, 3)
-    alone = arrows.alone(f, r)
+    alone = arrow.uncoupled(f, r)
     expected = (A.T @ dense @ f.ravel() - g)[there]
     off = system @ alone.ravel()[there] - expected
     assert np.abs(off).max() <= 1e-11 * np.abs(system).max() * np.abs(alone).max()
-    ds = lorentz.of(alone)
+    ds = lorentz.apply(alone)
     straight = dense @ (f - ds).ravel()
-    dz = arrows.split((A.T @ straight).reshape(-1, 3), f, ds)
+    dz = arrow.dual_step((A.T @ straight).reshape(-1, 3), f, ds)
     np.testing.assert_allclose(dz.ravel(), straight, atol=1e-9 * np.abs(straight).max())
 
 
@@ -248,21 +248,21 @@ def test_right_hand_sides_of_a_step_by_their_definitions(slides):
     w, ds, dz = rng.normal(size=(3, 100, 3))
     u = slides * rng.normal(size=(100, 3)) * [0, 1, 1]
     W = Scaling(s, z)
-    c, f = algebra.pulls(*W.parts, s, z, u, w)
+    c, f = algebra.right_hand_sides(*W.parts, s, z, u, w)
     expected = W.divide(w) - z
     expected[:, 0] -= (u * expected).sum(axis=1)
     np.testing.assert_allclose(c, expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(f, W.times(w) - s, rtol=1e-9, atol=1e-9)
     change = W.divide(W.divide(ds))
     change[:, 0] -= (u * change).sum(axis=1)
-    np.testing.assert_allclose(algebra.less_inverse_squares(*W.parts, u, w, ds), w - change, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(algebra.subtract_inverse_squared(*W.parts, u, w, ds), w - change, rtol=1e-9, atol=1e-9)
 
     aim = [0.3, 0, 0] - jordan_product(W.divide(ds), W.times(dz))
-    centred = jordan_product(W.times(z), algebra.centring(*W.parts, z, ds, dz, 0.3))
+    centred = jordan_product(W.times(z), algebra.mehrotra_correction(*W.parts, z, ds, dz, 0.3))
     np.testing.assert_allclose(centred, aim, rtol=1e-6, atol=1e-6)
     after = jordan_product(W.times(z) + 0.5 * W.divide(ds), W.times(z) + 0.5 * W.times(dz))
     low, high = 0.1, 1.0
-    moved = after + jordan_product(W.times(z), algebra.towards_path(*W.parts, z, ds, dz, 0.5, low, high))
+    moved = after + jordan_product(W.times(z), algebra.gondzio_correction(*W.parts, z, ds, dz, 0.5, low, high))
     for x, sign in ((moved, 1.0), (moved, -1.0)):
         length = np.hypot(after[:, 1], after[:, 2])
         along = (x * after)[:, 1:].sum(axis=1) / np.maximum(length, 1e-300)  # the directions stay

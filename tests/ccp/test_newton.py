@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import traceback
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,14 +13,15 @@ from mpi4py import MPI
 from problems import SELF, dense_of, from_graph, from_matrix, heap, matrix, part, random_graph
 from scipy.linalg import block_diag
 
-from pctt import ccp
+from pctt import ccp, memory
+from pctt.blocks import Shell
 from pctt.ccp import delassus, newton_for
 from pctt.ccp.interior.pdip import PDIP
-from pctt.ccp.newton import few as elimination
-from pctt.ccp.newton.few import Factors, ordered
+from pctt.ccp.newton import by_elimination, elimination
+from pctt.ccp.newton import factor as factors
+from pctt.ccp.newton.elimination import Factors, ordered
 from pctt.ccp.newton.forms import BodyForm, ContactForm
 from pctt.ccp.newton.kkt import KKT
-from pctt.ccp.newton.linear import Settings
 
 FORMS = pytest.mark.parametrize("form", ["contact", "body"])  # those that take any barrier blocks
 
@@ -26,7 +29,7 @@ FORMS = pytest.mark.parametrize("form", ["contact", "body"])  # those that take 
 @pytest.fixture(autouse=True)
 def few(request, monkeypatch):
     """Contacts of the problems that get factors by blocks: none, unless a test says more."""
-    monkeypatch.setattr(Settings, "few", getattr(request, "param", 0))
+    monkeypatch.setattr(by_elimination, "FEW", getattr(request, "param", 0))
 
 
 def barrier_and_side(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
@@ -41,7 +44,7 @@ def barrier_and_side(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("many", [20, 1000])
 def test_the_forms_agree_with_dense_algebra(form, many, monkeypatch):
     """Also where a body, here one that half of the contacts touch, has more contacts than N is filled with."""
-    monkeypatch.setattr(delassus, "HUB", many)
+    monkeypatch.setattr(delassus, "DENSE", many)
     comm, contacts, bodies, e = MPI.COMM_WORLD, 120, 30, 1e-2
     graph = random_graph(0, contacts, bodies, hub=True)
     G, here, own = graph.dense(), part(comm, contacts), part(comm, bodies)
@@ -60,7 +63,7 @@ def test_the_forms_agree_with_dense_algebra(form, many, monkeypatch):
     np.testing.assert_allclose(dv, ((G.T @ exact).reshape(-1, 6) - momenta)[own], rtol=0, atol=1e-6)
     np.testing.assert_allclose(problem.product(q[here]), (N @ q.ravel()).reshape(-1, 3)[here], rtol=0, atol=1e-6)
     assert newton.linear.fallbacks == 0
-    assert problem.has_hubs == (many == 20)
+    assert problem.has_dense_columns == (many == 20)
     newton.destroy()
 
 
@@ -151,7 +154,7 @@ def dense_kkt(N: np.ndarray, kkt: KKT) -> np.ndarray:
 @pytest.mark.parametrize(("each", "many"), [(1, 1000), (2, 1000), (2, 20)])
 def test_all_forms_give_the_step_of_the_matrix_with_multipliers(form, each, many, monkeypatch, database):
     """Also where a body has more contacts than N is filled with, and for a second problem of the same contacts."""
-    monkeypatch.setattr(delassus, "HUB", many)
+    monkeypatch.setattr(delassus, "DENSE", many)
     database["ksp_max_it"] = 5000
     comm, contacts, bodies, e = MPI.COMM_WORLD, 60, 20, 1e-2
     graph, here = random_graph(0, contacts, bodies, hub=True), part(comm, contacts)
@@ -217,7 +220,7 @@ def test_methods_without_multipliers_refuse_them_as_unknowns():
 
 
 def test_few_contacts_are_never_kept_apart():
-    G, some = delassus.without_hubs(SELF, from_graph(*heap(3)).contact_map.given)
+    G, some = delassus.without_dense_columns(SELF, from_graph(*heap(3)).contact_map.given)
     assert not some
     assert G.rows == 40
 
@@ -275,8 +278,8 @@ def test_few_contacts_get_factors_by_blocks(symmetric):
         newton.update(barrier, symmetric=symmetric)
         dg, _ = newton.solve(q, 1e-12)
         assert np.linalg.norm(S @ dg.ravel() - q.ravel()) <= 2e-12
-        assert newton.takes_any
-        assert "matrix" not in vars(newton.system)
+        assert newton.linear.takes_unsymmetric
+        assert "_mat" not in vars(newton.system)  # no object of PETSc
         assert (newton.linear.iterations <= 2, newton.linear.fallbacks) == (True, 0)
     newton.destroy()
 
@@ -285,13 +288,13 @@ def test_few_contacts_get_factors_by_blocks(symmetric):
 def test_contacts_that_would_fill_the_factors_are_not_few(monkeypatch):
     """The same where a body touches too many of them for their matrix to be made."""
     newton = ccp.Newton(SELF, "body")
-    assert newton.has_few(from_graph(*heap(3, hub=True)))
+    assert newton.has_elimination(from_graph(*heap(3, hub=True)))
     monkeypatch.setattr(elimination, "LEAST", 1)
     for pairs, rest in ((10, 40), (300, 40), (10**6, 5)):
-        monkeypatch.setattr(Settings, "pairs", pairs)
-        monkeypatch.setattr(Settings, "rest", rest)
+        monkeypatch.setattr(by_elimination, "PAIRS", pairs)
+        monkeypatch.setattr(by_elimination, "REST", rest)
         problem = from_graph(*heap(3, hub=True))
-        assert not newton.has_few(problem)
+        assert not newton.has_elimination(problem)
         assert newton.begin(problem) is problem
     newton.destroy()
 
@@ -370,4 +373,39 @@ def test_systems_with_multipliers_go_from_one_constraint_of_a_contact_to_two_and
         found = ccp.solve(problem, None, "pdip", ccp.Limits(1e-6), PDIP(form=form), newton, ccp.RELAXATION)
         assert found.converged, found.reason
         assert found.solver == "pdip"
+    newton.destroy()
+
+
+@pytest.mark.parametrize(("solver", "form"), [("pdip", "contact"), ("pdip", "kkt"), ("conic", "body")])
+def test_few_calls_lie_between_a_solve_and_a_product_of_its_matrix(solver, form, monkeypatch):
+    depths: list[int] = []
+    product = Shell.mult
+
+    def noted(*given):
+        names = [(Path(frame.filename).parent.name, frame.name) for frame in traceback.extract_stack()]
+        depths.append(len(names) - names.index(("ccp", "solve")) - 1)  # without this one
+        product(*given)
+
+    monkeypatch.setattr(Shell, "mult", noted)
+    newton = newton_for(SELF, solver, form)
+    ccp.solve(from_graph(*heap(bodies=30)), None, solver, ccp.Limits(1e-6), newton=newton, law=ccp.RELAXATION)
+    newton.destroy()
+    assert depths
+    assert max(depths) <= 9
+    assert min(depths) <= 7  # without a factor
+
+
+def test_the_memory_is_looked_up_once(monkeypatch):
+    """What else runs on the machine changes no later choice; a result says where a factor had no room."""
+    looks: list[int] = []
+    monkeypatch.setattr(memory, "available", lambda comm: looks.append(0) or (1e5 if len(looks) == 1 else 1e12))
+    monkeypatch.setattr(factors, "EASY", 0.1)
+    newton = newton_for(SELF, "conic")
+    known, graph = heap(bodies=30)
+    for _ in range(2):
+        problem = from_graph(known, graph)
+        found = ccp.solve(problem, None, "conic", ccp.Limits(1e-8), newton=newton, law=ccp.RELAXATION)
+        assert found.converged
+        assert found.reason.endswith("; no room for a factor in 0.0001 GB of memory")
+    assert len(looks) == 1
     newton.destroy()

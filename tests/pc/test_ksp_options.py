@@ -111,16 +111,15 @@ def fails_alone(): # where the others go on to the end, however long they take
     time.sleep(0.5)
 
 
-assert krylov.on_all_ranks(comm, fails_alone) == 76
+with krylov.OnAllRanks(comm) as block:
+    fails_alone()
+assert block.error == 76
 print("agreed", flush=True)
 
 
-def fails_amidst(): # where the others wait for it
+with krylov.OnAllRanks(comm, patience=0.5): # where the others wait for it
     fails_alone()
     x.norm()
-
-
-krylov.on_all_ranks(comm, fails_amidst, patience=0.5)
 print("not to be reached", flush=True)
 """
 

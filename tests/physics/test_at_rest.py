@@ -45,7 +45,7 @@ def overhang(part, count=8):
 
 
 def wall(rows=12, columns=12):
-    """More contacts than `pctt.ccp.newton.few` takes."""
+    """More contacts than `pctt.ccp.newton.elimination` takes."""
     scene = on_floor()
     places = [
         [2 * H * (i + 0.5 * (k % 2)), 0, H * (0.5 + k)] for k in range(rows) for i in range(columns - k % 2)

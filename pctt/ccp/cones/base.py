@@ -131,7 +131,7 @@ class Cones(ABC):
         """||`move`||^2, |g|^2, closing work, opening work and 1/2 g.(y - r) of this rank's contacts (5,), and the
         greatest speed at which one closes. ``units`` (2, rows, 3) multiply g and y."""
 
-    def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
+    def active(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
         """Mask (count,) of the contacts but those without an impulse at x and last_x whose distance inside the dual
         cone, y_n less `de_saxce`, exceeds the ``least``."""
         x, last_x, opening = x[: self.count, 0], last_x[: self.count, 0], y[: self.count, 0] - self.de_saxce(y)
@@ -142,7 +142,7 @@ class Cones(ABC):
     def step_length(self, x: Array, dx: Array) -> float:
         """Largest a such that x + a dx is in the cones of this rank (inf where nothing limits it); x is inside."""
         form = self.lorentz()
-        return step_inside(form.of(x), form.of(dx))
+        return step_inside(form.apply(x), form.apply(dx))
 
     def lorentz(self) -> LorentzForm:
         """The cones as Lorentz cones."""

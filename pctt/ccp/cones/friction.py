@@ -44,8 +44,8 @@ def project_to(x: Array, mu: Array, out: Array) -> Array:
 
 
 @loop
-def not_idle(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDArray[np.bool_]:
-    """The loop of `FrictionCones.not_idle`."""
+def active(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDArray[np.bool_]:
+    """The loop of `FrictionCones.active`."""
     out, enough = np.empty(len(mu), np.bool_), x.dtype.type(least)
     x, last_x, y = x.ravel(), last_x.ravel(), y.ravel()
     for c in range(len(mu)):
@@ -267,7 +267,7 @@ def project(x: Array, mu: Array, out: Array | None = None) -> Array:
 
 
 class FrictionCones(Cones):
-    """The cones of contacts with friction ``mu`` (count,)."""
+    """The cones |g_t| <= mu g_n hold the impulses of contacts with friction ``mu`` (count,)."""
 
     tangents, what = ((1, 2),), "friction"
 
@@ -304,8 +304,8 @@ class FrictionCones(Cones):
     ) -> tuple[Array, float]:
         return errors(g, y, r, step, self.mu, float(coulomb), np.empty((0, *r.shape)) if units is None else units)
 
-    def not_idle(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
-        return not_idle(x, last_x, y, self.mu, least)
+    def active(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
+        return active(x, last_x, y, self.mu, least)
 
     def step_length(self, x: Array, dx: Array) -> float:
         return step_to_boundary(x, dx, self.mu)

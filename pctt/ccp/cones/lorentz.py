@@ -32,6 +32,7 @@ from dem.compiled import inlined, loop
 
 Array = NDArray[np.float64]
 TINY = float(np.finfo(float).tiny)
+HELD = 1e12  # stiffness of what is held, over that of normal impulses: the block keeps its digits
 LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
 ROUND = 1e-14  # tangential part of a unit scaling point below which it has no direction
 
@@ -48,47 +49,47 @@ class LorentzForm:
         """``coefficient`` (k, count); ``tangents``: of each cone, the numbers of a contact beside the first."""
         self.number, self.count = coefficient.shape
         self.weight = np.where(coefficient > 0, coefficient, 1.0)
-        self.live = (coefficient > 0).astype(float)
+        self.positive = (coefficient > 0).astype(float)
         self.width = 1 + sum(map(len, tangents))
         self.rows = self.count * self.width // 3
         #: (k, 2) of the tangential numbers among those of a contact; -1: there is none
         self.place = np.array([[*where, -1][:2] for where in tangents])
-        self.known = self.back(np.ones((coefficient.size, 3)))
-        self.known[: self.count, 0] = 1.0
+        self.mask = self.transpose(np.ones((coefficient.size, 3)))
+        self.mask[: self.count, 0] = 1.0
 
-    def of(self, g: Array) -> Array:
+    def apply(self, g: Array) -> Array:
         """A g of impulses or other numbers of contacts (rows, 3)."""
         out = np.zeros((self.weight.size, 3))
-        _of(g, self.weight, self.live, self.place, out)
+        _of(g, self.weight, self.positive, self.place, out)
         return out
 
-    def back(self, z: Array) -> Array:
+    def transpose(self, z: Array) -> Array:
         """A'z (rows, 3)."""
-        return _back(z, self.weight, self.live, self.place, np.zeros((self.rows, 3)), False)
+        return _back(z, self.weight, self.positive, self.place, np.zeros((self.rows, 3)), False)
 
     def impulses(self, s: Array) -> Array:
         """The g (rows, 3) with A g = s; where the normal numbers of a contact disagree, with the greatest."""
-        return _back(s, self.weight, self.live, self.place, np.zeros((self.rows, 3)), True)
+        return _back(s, self.weight, self.positive, self.place, np.zeros((self.rows, 3)), True)
 
-    def spread(self, y: Array) -> Array:
+    def right_inverse(self, y: Array) -> Array:
         """A z with A'z = y (rows, 3): all cones have the same part of the normal numbers."""
-        z = self.of(y)
+        z = self.apply(y)
         z[:, 0] = (y[: self.count, 0] / self.weight / self.number).ravel()
         return z
 
-    def arrows(self, root: Array, size: Array, u: Array, normal: Array, tangential: Array) -> Arrows:
+    def arrow(self, root: Array, size: Array, u: Array, normal: Array, tangential: Array) -> ArrowInverse:
         """Of scalings ``root``, ``size`` (`scaling`) and directions of sliding ``u`` (k count, 3), zero
         without Coulomb's law, where C is ``normal`` (count,) and, in tangential numbers, ``tangential`` (k count,)."""
         shape = (self.count, self.width, self.width)
-        given = self.weight.ravel(), self.live.ravel(), self.place, normal, tangential
+        given = self.weight.ravel(), self.positive.ravel(), self.place, normal, tangential
         X = np.zeros(shape)
-        return Arrows(self, tangential, X, *_arrows(root, size, u, *given, X))
+        return ArrowInverse(self, tangential, X, *_arrows(root, size, u, *given, X))
 
     def barriers(self, root: Array, size: Array, u: Array, least: float, more: Array) -> Array:
         """B (count, width, width), with ``more`` (count, width) on its diagonal; what the problem does not have is held
-        by at least 1e12 times ``least``."""
+        by at least HELD times ``least``."""
         B = np.zeros((self.count, self.width, self.width))
-        _barriers(root, size, u, self.weight.ravel(), self.live.ravel(), self.place, least, more, B)
+        _barriers(root, size, u, self.weight.ravel(), self.positive.ravel(), self.place, least, more, B)
         return B
 
 
@@ -102,9 +103,9 @@ def rows(x: Array, parts: int) -> Array:
     return x if parts == 1 else np.concatenate(np.split(x, parts, axis=1))
 
 
-class Arrows(NamedTuple):
+class ArrowInverse(NamedTuple):
     """X (count, width, width) and its parts. Of each cone: ``right`` and ``left`` (k count, 2), D (k count, 3), the
-    ``part`` (k count,) of sigma (count,); and ``rise`` (k count,) and ``turn`` (k count, 2), see `split`."""
+    ``part`` (k count,) of sigma (count,); and ``rise`` (k count,) and ``turn`` (k count, 2), see `dual_step`."""
 
     lorentz: LorentzForm
     tangential: Array
@@ -117,20 +118,20 @@ class Arrows(NamedTuple):
     rise: Array
     turn: Array
 
-    def split(self, dy: Array, f: Array, ds: Array) -> Array:
+    def dual_step(self, dy: Array, f: Array, ds: Array) -> Array:
         """T^-1 dz (k count, 3) of the step ds = f - W^2 dz with A'T^-1 dz = dy (rows, 3).
 
         The tangential numbers are those of dy. With them eliminated from W^-2, normal ones are a sum that does not
         cancel, where a product with W^-2 would end at 1e-6. What rounding leaves of dy_n the cones share."""
         cones = self.lorentz
-        dz = cones.of(dy)
+        dz = cones.apply(dy)
         dz[:, 0] = self.rise * (f[:, 0] - ds[:, 0]) - self.turn[:, 0] * dz[:, 1] - self.turn[:, 1] * dz[:, 2]
         part = cones.weight * self.part.reshape(cones.number, -1)
         lack = dy[: cones.count, 0] - (cones.weight * dz[:, 0].reshape(cones.number, -1)).sum(axis=0)
         dz[:, 0] += (part * (lack / (cones.weight * part).sum(axis=0))).ravel()
         return dz
 
-    def alone(self, f: Array, r: Array) -> Array:
+    def uncoupled(self, f: Array, r: Array) -> Array:
         """X (A' T^-1 W^-2 f - r) (rows, 3) of f (k count, 3) and r (rows, 3), without a product with W^-2, which would
         drown in rounding: late in an iteration it has eigenvalues that differ by 1e18."""
         lorentz, parts_of = self.lorentz, self.lorentz.width // 3
@@ -263,7 +264,7 @@ def _barriers(root, size, u, weight, live, place, least, more, B):
                             B[c, m, place[i // count, b]] += 2.0 * across * h[a] * h[b]
         for m in range(1, B.shape[1]):
             if B[c, m, m] == 0.0:
-                B[c, m, m] = 1e12 * max(B[c, 0, 0], least)
+                B[c, m, m] = HELD * max(B[c, 0, 0], least)
         for m in range(B.shape[1]):
             B[c, m, m] += more[c, m]
 
@@ -304,7 +305,7 @@ def scaling(s: Array, z: Array) -> tuple[Array, Array]:
 
 
 @loop
-def pulls(root: Array, size: Array, s: Array, z: Array, u: Array, w: Array) -> tuple[Array, Array]:
+def right_hand_sides(root: Array, size: Array, s: Array, z: Array, u: Array, w: Array) -> tuple[Array, Array]:
     """T^-1 (W^-1 w - z) and W w - s (nc, 3); u (nc, 3) is the direction of sliding in T = 1 + e u'."""
     out, other = np.empty(s.shape), np.empty(s.shape)
     for c in range(len(s)):
@@ -317,8 +318,8 @@ def pulls(root: Array, size: Array, s: Array, z: Array, u: Array, w: Array) -> t
 
 
 @loop
-def less_inverse_squares(root: Array, size: Array, u: Array, x: Array, y: Array) -> Array:
-    """x - T^-1 W^-2 y (nc, 3), with the T of `pulls`."""
+def subtract_inverse_squared(root: Array, size: Array, u: Array, x: Array, y: Array) -> Array:
+    """x - T^-1 W^-2 y (nc, 3), with the T of `right_hand_sides`."""
     out = np.empty(x.shape)
     for c in range(len(x)):
         out[c, 0], out[c, 1], out[c, 2] = _scaled(root, size, c, y, True)
@@ -329,7 +330,7 @@ def less_inverse_squares(root: Array, size: Array, u: Array, x: Array, y: Array)
 
 
 @loop
-def centring(root: Array, size: Array, z: Array, ds: Array, dz: Array, target: float) -> Array:
+def mehrotra_correction(root: Array, size: Array, z: Array, ds: Array, dz: Array, target: float) -> Array:
     """The w (nc, 3) with W z o w = target e - W^-1 ds o W dz."""
     out = np.empty(z.shape)
     for c in range(len(z)):
@@ -341,7 +342,7 @@ def centring(root: Array, size: Array, z: Array, ds: Array, dz: Array, target: f
 
 
 @loop
-def towards_path(
+def gondzio_correction(
     root: Array, size: Array, z: Array, ds: Array, dz: Array, reach: float, low: float, high: float
 ) -> Array:
     """The w (nc, 3) with W z o w = d: the d that moves the spectral values of (W z + reach W^-1 ds) o (W z + reach W

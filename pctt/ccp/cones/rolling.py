@@ -35,8 +35,8 @@ from pctt.ccp.cones.friction import (
 
 
 class RollingCones(Cones):
-    """The cones of contacts with coefficients (count,): of friction ``mu``, and of ``rolling`` and ``spinning``, which
-    are lengths over those of the contacts."""
+    """The cones hold impulses and moments of contacts with coefficients (count,): ``mu`` of friction, ``rolling`` and
+    ``spinning``, of which the last two are lengths over those of the contacts."""
 
     tangents, what = ((1, 2), (4, 5), (3,)), "rolling or spinning resistance"
 

@@ -7,7 +7,7 @@ line search is a Rayleigh quotient.
 N is applied once per iteration, in two halves. The first gives the velocities of the contacts at the extrapolated point
 from the images of the last two iterates, their momenta on the bodies. The second gives the image of the new point, and
 with it the curvature along the step, so a step that is repeated costs half. In single precision a contact moves 92
-bytes in the first half, 64 in the step, 80 in the second: 236, and none while it sleeps.
+bytes in the first half, 64 in the step, 80 in the second: 236, and none outside the active set.
 
 For Coulomb's law the De Saxce term mu |y_t| of the present gradient is added to it in every iteration. Then the law is
 the fixed point of the projected step, and one run finds it. But that step is no gradient step: the term is not the
@@ -29,6 +29,9 @@ from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.options import number
 
+IMPATIENT = 300  # iterations without progress in single precision: double precision takes over
+NEAR = 1e-4  # residual below which slow chains of force are left
+
 
 @dataclass(frozen=True)
 class APGD(FirstOrder):
@@ -40,7 +43,7 @@ class APGD(FirstOrder):
     decay: float = number(0.99, "factor on L after each step, so that steps grow again where the curvature allows it")
     theta: float = number(0.2, "where momentum begins: below 1, as steps are short for most directions of descent")
     damping: float = number(0.05, "Coulomb's law: 1 - the greatest momentum; docs/notebook_ccp.md has trials")
-    near: float = number(0.03, "the same below a residual of 1e-4, where slow chains of force are left")
+    near: float = number(0.03, "the same below the residual NEAR, where slow chains of force are left")
     growth: float = number(6.0, "Coulomb's law: of a squared step over the least one, where momentum begins anew")
     single: float = number(
         3e-4,
@@ -58,7 +61,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: APGD, cou
     progress = None
     if problem.contact_map is not None:
         rough = limits.to(max(limits.tol, options.single / np.sqrt(max(problem.size, 1))))
-        impatient = replace(options, patience=min(options.patience, 300))  # double precision takes over
+        impatient = replace(options, patience=min(options.patience, IMPATIENT))
         progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, impatient)
         rough_impulse = _descend(progress, guess, options)
         if progress.best <= limits.aimed:
@@ -75,18 +78,18 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     scaled, coulomb = progress.problem, progress.problem.coulomb
     now = scaled.iterate(scaled.start(guess))
     last, new, y = now.copy(), now.copy(), np.empty_like(now.x)
-    lipschitz, awake = options.lipschitz, True
+    lipschitz, whole = options.lipschitz, True
     theta, beta, step, least = options.theta, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, its least since beta = 0
     while True:
         if progress.is_due(math.sqrt(step)):
-            now, last, new, y = scaled.wake(now, last, new)
+            now, last, new, y = scaled.restore(now, last, new)
             if not progress.goes_on(now.x, scaled.look(now, y)):
                 return progress.impulse
-            awake = True
+            whole = True
         scaled.rigid_gradient(now, last, beta, y)  # at z = x + beta (x - last_x)
-        if awake and step > 0:
-            now, last, new, y = scaled.fall_asleep(now, last, new, y, math.sqrt(step))
-            awake = False
+        if whole and step > 0:
+            now, last, new, y = scaled.restrict(now, last, new, y, math.sqrt(step))
+            whole = False
         while True:
             curvature, length, uphill = scaled.step(now, last, beta, y, 1 / lipschitz, new)
             progress.iterations += 1
@@ -101,6 +104,6 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
             last_theta, theta = theta, theta * (np.sqrt(theta**2 + 4) - theta) / 2
             beta, least = last_theta * (1 - last_theta) / (last_theta**2 + theta), min(least, step)
             if coulomb:
-                beta = min(beta, 1 - (options.near if progress.best < 1e-4 else options.damping))
+                beta = min(beta, 1 - (options.near if progress.best < NEAR else options.damping))
         last, now, new = now, new, last
         lipschitz *= options.decay

@@ -24,7 +24,7 @@ from dem.contact_map import Halo, find_halo
 from dem.exchange import offsets
 from pctt.ccp.cones import Array
 from pctt.ccp.cones.friction import project
-from pctt.ccp.delassus import HUB, rows_in_blocks
+from pctt.ccp.delassus import DENSE, rows_in_blocks
 from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
@@ -45,9 +45,9 @@ class GaussSeidel(FirstOrder):
 
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: GaussSeidel) -> Result:
     """Impulses from a first guess (nc, 3)."""
-    if problem.has_hubs:
+    if problem.has_dense_columns:
         raise OptionError(
-            f"-ccp_type gauss_seidel: a body has more than {HUB} contacts, whose rows of N would be full; "
+            f"-ccp_type gauss_seidel: a body has more than {DENSE} contacts, whose rows of N would be full; "
             "allowed are the others"
         )
     scaled = ScaledProblem(problem)

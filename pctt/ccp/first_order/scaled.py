@@ -17,7 +17,7 @@ from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.options import number
 
-MANY = 0.9  # of the contacts awake: to put these side by side would take as long as all take until the next look
+MANY = 0.9  # of the contacts active: to put these side by side would take as long as all take until the next look
 RATIO = 0.4  # of the natural residual to |L step| / |x|: 0.3 to 0.5 from the second step on, all scenes, both laws
 
 
@@ -34,8 +34,8 @@ class Iterate(NamedTuple):
         return Iterate(self.x.copy(), self.image.copy())
 
 
-class Awake(NamedTuple):
-    """The contacts that iterations work on: all, or those that have not fallen asleep."""
+class ActiveSet(NamedTuple):
+    """The contacts that iterations work on: all, or an active set of them."""
 
     rows: Rows | None  #: (n,) of the arrays (nc, 3); None: all
     operator: ContactMap | GivenOperator
@@ -71,7 +71,7 @@ class ScaledProblem:
         self.cones = problem.cones.scaled(self._velocity, precision)
         self._operator = problem.operator.scaled(self.shrink, precision)
         soft = self._compliance[: None if problem.yields else 0]
-        self._all = self._awake = Awake(None, self._operator, self.cones, self.b, soft)
+        self._all = self._active = ActiveSet(None, self._operator, self.cones, self.b, soft)
 
     def _rounded(self, x: Array) -> Array:
         return x.astype(self.precision, copy=False)
@@ -110,54 +110,55 @@ class ScaledProblem:
 
     def rigid_gradient(self, now: Iterate, last: Iterate, beta: float, out: Array) -> Array:
         """(A - C) z + b at z = x + beta (x - last_x), into ``out``, from images alone: half a product."""
-        self._awake.operator.find_velocities(now.image, last.image, beta, self._awake.b, out)
+        self._active.operator.find_velocities(now.image, last.image, beta, self._active.b, out)
         return out
 
     def look(self, now: Iterate, y: Array) -> Array:
-        """A x + b (nc, 3) where all contacts are awake, and ``y`` its rigid part."""
+        """A x + b (nc, 3) where all contacts are active, and ``y`` its rigid part."""
         self.rigid_gradient(now, now, 0.0, y)
         return y + self._compliance * now.x if self.problem.yields else y
 
-    def wake(self, now: Iterate, last: Iterate, new: Iterate) -> tuple[Iterate, Iterate, Iterate, Array]:
+    def restore(self, now: Iterate, last: Iterate, new: Iterate) -> tuple[Iterate, Iterate, Iterate, Array]:
         """The iterates with all contacts, memory for a new one, and memory (nc, 3) for a gradient."""
-        rows, self._awake = self._awake.rows, self._all
+        rows, self._active = self._active.rows, self._all
         if rows is not None:
-            now, last = (self._spread(iterate, rows) for iterate in (now, last))
+            now, last = (self._scattered(iterate, rows) for iterate in (now, last))
         return now, last, Iterate(np.empty_like(now.x), new.image), np.empty_like(now.x)
 
-    def _spread(self, iterate: Iterate, rows: Rows) -> Iterate:
+    def _scattered(self, iterate: Iterate, rows: Rows) -> Iterate:
         x = np.zeros_like(self.b)
         _put(rows, iterate.x, x)
         return Iterate(x, iterate.image)
 
-    def fall_asleep(
+    def restrict(
         self, now: Iterate, last: Iterate, new: Iterate, y: Array, length: float
     ) -> tuple[Iterate, Iterate, Iterate, Array]:
-        """Let contacts sleep that will stay open until the next look, as far as one can see: they have no impulse, and
+        """Leave out contacts that will stay open until the next look, as far as one can see: they have no impulse, and
         open five times faster than steps change velocities, which is the root mean square of their ``length`` |L step|.
         A contact too many costs iterations, but no accuracy. ``y`` (nc, 3) is the rigid gradient of all contacts.
-        Returns what `wake` does, of those awake, with this gradient: fewer, side by side, move fewer bytes."""
+        Returns what `restore` does, of the active set, with this gradient: fewer, side by side, move fewer bytes."""
         every = self._all
-        if isinstance(every.operator, GivenOperator) or not every.operator.has_parts:
+        if not every.operator.has_parts:
             return now, last, new, y
         faster = float(5 * length / np.sqrt(max(self.problem.size, 1)))
-        contacts = np.flatnonzero(self.cones.not_idle(now.x, last.x, y, faster))
+        contacts = np.flatnonzero(self.cones.active(now.x, last.x, y, faster))
         if len(contacts) > MANY * self.cones.count:
             return now, last, new, y
         rows = self.cones.rows_of(contacts)
 
-        def awake(array: Array) -> Array:
+        def active(array: Array) -> Array:
             return np.take(array, rows, axis=0) if len(array) else array
 
-        now, last, y = Iterate(awake(now.x), now.image), Iterate(awake(last.x), last.image), awake(y)
+        now, last, y = Iterate(active(now.x), now.image), Iterate(active(last.x), last.image), active(y)
+        assert isinstance(every.operator, ContactMap)
         operator, cones = every.operator.only(contacts), self.cones.only(contacts)
-        self._awake = Awake(rows, operator, cones, awake(every.b), awake(every.compliance))
+        self._active = ActiveSet(rows, operator, cones, active(every.b), active(every.compliance))
         return now, last, Iterate(np.empty_like(y), new.image), y
 
     def step(self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate) -> list[float]:
         """The projected step of this length from z, where the rigid gradient is y, into ``new``; of the step d from z
         d'Ad and |d|^2, and y_z'(x_new - x), with y_z the gradient at z with the De Saxce term of Coulomb's law."""
-        _, operator, cones, _, soft = self._awake
+        _, operator, cones, _, soft = self._active
         work, square, uphill = cones.accelerated_step(now.x, last.x, y, soft, beta, length, self.coulomb, new.x)
         operator.find_image(*new)
         work += operator.energy_of_step(new.image, now.image, last.image, beta)
@@ -272,7 +273,7 @@ class Progress:
         self._next_look = self.iterations + self.check
         residual = self._residual(x, gradient)
         self.history.append(residual)
-        self.limits.tell(self.iterations, residual)
+        self.limits.report(self.iterations, residual)
         if residual < self.best or self._looks == 0:
             self.best, self._point = residual, x.copy()
         self._looks += 1

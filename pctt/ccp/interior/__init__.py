@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pctt.ccp.cones import TINY, Array
+from pctt.ccp.cones.lorentz import HELD
 from pctt.ccp.problem import ConeProblem
 
 INDEFINITE = "N is not positive semidefinite: a step has negative curvature"
@@ -36,4 +37,4 @@ def is_indefinite(problem: ConeProblem, dg: Array, dy: Array) -> bool:
 def hold(blocks: Array, free: NDArray[np.bool_], stiff: Array) -> None:
     """Hold the tangential impulses of contacts that are ``free`` of friction at zero: in their blocks (nc, 3, 3), with
     a number that is large beside ``stiff`` (nc,), the normal entry of the barrier."""
-    blocks[free, 1, 1] = blocks[free, 2, 2] = 1e12 * np.maximum(stiff[free], 1.0)
+    blocks[free, 1, 1] = blocks[free, 2, 2] = HELD * np.maximum(stiff[free], 1.0)

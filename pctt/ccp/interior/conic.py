@@ -35,7 +35,7 @@ import numpy as np
 
 from pctt.ccp.cones import TINY, Array, dot, lorentz, tangential
 from pctt.ccp.cones.friction import step_to_zero
-from pctt.ccp.cones.lorentz import Arrows, NesterovTodd
+from pctt.ccp.cones.lorentz import ArrowInverse, NesterovTodd
 from pctt.ccp.interior import useful_part
 from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem, Errors
@@ -43,6 +43,8 @@ from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.log import phase
 from pctt.options import number
+
+LESS, HALF = 0.9, 0.5  # of the least residual, and of the last complementarity, that count as progress
 
 
 @dataclass(frozen=True)
@@ -68,43 +70,44 @@ def solve(
     problem: ConeProblem, guess: Array, limits: Limits, options: Conic, newton: Newton, coulomb: bool = False
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step."""
-    given, problem, linear = problem, newton.begin(problem), newton.linear
-    if coulomb and not newton.takes_any:
+    given, problem = problem, newton.begin(problem)
+    if coulomb and not newton.linear.takes_unsymmetric:
         words = "Coulomb's law needs -ccp_newton body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
-    conic = ConicProblem(problem, options, coulomb, newton.system.mends)
+    conic = ConicProblem(problem, options, coulomb, newton.system.error_in_momenta)
     at, history, waited, least, last_gap = conic.start(guess), list[float](), 0, np.inf, np.inf
     while True:
         # residuals
         found, gap = conic.residuals(at), problem.dot(at.s, at.z)
         history.append(limits.residual(found.errors))
-        limits.tell(len(history) - 1, history[-1])
+        limits.report(len(history) - 1, history[-1])
         unbounded = bool(why_unbounded(given, found.g, found.y))
         if unbounded or history[-1] == min(history):
             best = found.g
-        waited = 0 if found.errors.natural <= 0.9 * least or gap <= 0.5 * last_gap else waited + 1
+        progress = found.errors.natural <= LESS * least or gap <= HALF * last_gap
+        waited = 0 if progress else waited + 1
         least, last_gap = min(found.errors.natural, least), gap
         done = history[-1] <= limits.aimed or unbounded
         if done or len(history) > limits.max_it or waited > options.patience:
             break
         # scaling
-        scaled = conic.scaled(at, found)
-        newton.update(*scaled.blocks(), symmetric=not coulomb)
+        linear = conic.linearised(at, found)
+        newton.update(*linear.blocks(), symmetric=not coulomb)
         # affine step
         with phase("ConicPredictor"):
-            affine = scaled.direction(newton, np.zeros_like(at.z))
+            affine = linear.direction(newton, np.zeros_like(at.z))
         # centring: the further the affine step may go, the less (Mehrotra)
-        target = max((1.0 - min(1.0, scaled.reach(affine))) ** 3, options.least) * gap / conic.count
+        target = max((1.0 - min(1.0, linear.reach(affine))) ** 3, options.least) * gap / conic.count
         with phase("ConicCorrector"):
             # combined step, with the second-order term of the affine one
-            w = scaled.centred(affine, target)
-            direction = scaled.direction(newton, w, affine.x)
+            w = linear.mehrotra_correction(affine, target)
+            direction = linear.direction(newton, w, affine.x)
             # length: of a step that the cones cut short, towards the central path if that is longer
-            step = scaled.step(direction)
+            step = linear.step(direction)
             if step < options.short:
-                w += scaled.towards_path(direction, min(1.0, step + options.reach), target)
-                other = scaled.direction(newton, w, direction.x)
-                step, direction = max((step, direction), (scaled.step(other), other), key=lambda pair: pair[0])
+                w += linear.gondzio_correction(direction, min(1.0, step + options.reach), target)
+                other = linear.direction(newton, w, direction.x)
+                step, direction = max((step, direction), (linear.step(other), other), key=lambda pair: pair[0])
         # update
         if step > 0:
             at = conic.moved(at, direction, step)
@@ -114,7 +117,8 @@ def solve(
         status, words = Status.CONVERGED, limits.met
     elif iterations == limits.max_it:
         status, words = Status.ITERATION_LIMIT, f"{iterations} iterations"
-    return Result(best, status, words, min(history), iterations, linear.iterations, linear.fallbacks, history)
+    counts = newton.linear.iterations, newton.linear.fallbacks
+    return Result(best, status, words, min(history), iterations, *counts, history)
 
 
 class Point(NamedTuple):
@@ -150,13 +154,13 @@ class Direction(NamedTuple):
 class ConicProblem:
     """The problem in its Lorentz cones: s = A g, y = A'z.
 
-    mends : whether Newton systems mend what an inexact solve leaves
+    error_in_momenta : whether the error of an inexact solve is one of momenta, which the next step mends
     compliance, tangential : (count,), and of all cones (k count,), the parts of C within a step
     within : (count, width) the same but for the problem's own C
     """
 
-    def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool, mends: bool):
-        self.problem, self.options, self.coulomb, self.mends = problem, options, coulomb, mends
+    def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool, error_in_momenta: bool):
+        self.problem, self.options, self.coulomb, self.error_in_momenta = problem, options, coulomb, error_in_momenta
         self.form = problem.cones.lorentz()
         self.count = problem.size * self.form.number  # of Lorentz cones on all ranks
         self.proximal = options.proximal * problem.mean_diagonal
@@ -167,43 +171,43 @@ class ConicProblem:
         self.within[:, 0] = self.proximal * (self.form.weight**2).sum(0)
         self.boundary = options.boundary_with_law if coulomb else options.boundary
         forcing = options.forcing_with_law if coulomb else options.forcing
-        self.forcing = forcing if mends else options.forcing_of_impulses
+        self.forcing = forcing if error_in_momenta else options.forcing_of_impulses
         self._still = np.zeros((self.form.weight.size, 3))
 
     def start(self, guess: Array) -> Point:
         """A pair on the central path near the guess: s - tau z = s_0 - tau z_0. Where cones share a normal impulse all
         get the greatest one."""
         problem, form = self.problem, self.form
-        guess = useful_part(problem, guess) * form.known
-        y = (problem.product(guess) + problem.r) * form.known
-        diagonal = form.of(problem.diagonal)
+        guess = useful_part(problem, guess) * form.mask
+        y = (problem.product(guess) + problem.r) * form.mask
+        diagonal = form.apply(problem.diagonal)
         diagonal[:, 0] /= form.weight.ravel() ** 3
         tau = 1.0 / np.maximum(diagonal.mean(1), 1e-3 * problem.mean_diagonal)
         amount = self.options.start * problem.dot(problem.r, problem.r) / problem.size / problem.mean_diagonal
-        z = form.spread(y)
-        s, z = lorentz.central_pair(form.of(guess) - tau[:, None] * z, tau, amount)
+        z = form.right_inverse(y)
+        s, z = lorentz.central_pair(form.apply(guess) - tau[:, None] * z, tau, amount)
         g = form.impulses(s)
-        return Point(form.of(g), z, problem.momentum(g))
+        return Point(form.apply(g), z, problem.momentum(g))
 
     def residuals(self, at: Point) -> Residuals:
         problem, form = self.problem, self.form
         g = form.impulses(at.s)
         momentum = problem.momentum(g)
         rest = problem.compliance * g + problem.r
-        y = (problem.velocity_of(momentum) + rest) * form.known
-        r_y = (problem.velocity_of(at.v) + rest) * form.known
-        r_y -= form.back(without_de_saxce(at.z) if self.coulomb else at.z)
+        y = (problem.velocity_of(momentum) + rest) * form.mask
+        r_y = (problem.velocity_of(at.v) + rest) * form.mask
+        r_y -= form.transpose(without_de_saxce(at.z) if self.coulomb else at.z)
         return Residuals(g, y, problem.errors(g, y, self.coulomb), at.v - momentum, r_y)
 
-    def scaled(self, at: Point, found: Residuals) -> Scaled:
+    def linearised(self, at: Point, found: Residuals) -> Linearised:
         """The linear equations of an iterate."""
         with phase("CCPBarrier"):
             W = NesterovTodd(*lorentz.scaling(at.s, at.z))
             u = sliding_directions(at.z) if self.coulomb else self._still
-            arrows = self.form.arrows(*W, u, self.compliance, self.tangential) if self.mends else None
+            arrow = self.form.arrow(*W, u, self.compliance, self.tangential) if self.error_in_momenta else None
         # the velocities that the natural residual stands for
         shown = found.errors.natural * self.problem.norm(found.g) * self.problem.mean_diagonal
-        return Scaled(self, at, found, W, u, arrows, self.forcing * shown)
+        return Linearised(self, at, found, W, u, arrow, self.forcing * shown)
 
     def moved(self, at: Point, d: Direction, step: float) -> Point:
         """The point after a step; for Coulomb's law with De Saxce's terms of its velocities."""
@@ -211,13 +215,13 @@ class ConicProblem:
         return Point(at.s + step * d.ds, z, at.v + step * d.dv)
 
 
-class Scaled(NamedTuple):
+class Linearised(NamedTuple):
     """An iteration's linear equations, which all its directions share.
 
     at, found : the iterate and its residuals
     W : scaling of the pair
     u : directions in which contacts slide, for T; zero without Coulomb's law
-    arrows : (B + C)^-1, for systems that mend
+    arrow : (B + C)^-1, where errors are those of momenta
     tol : residual to which Newton systems are solved [m/s]
     """
 
@@ -226,28 +230,28 @@ class Scaled(NamedTuple):
     found: Residuals
     W: NesterovTodd
     u: Array
-    arrows: Arrows | None
+    arrow: ArrowInverse | None
     tol: float
 
     def blocks(self) -> tuple[Array | None, Array | None]:
         """What `Newton.update` takes: the blocks B, with the compliance that problems do not have, or (B + C)^-1."""
-        if self.arrows is not None:
-            return None, self.arrows.X
+        if self.arrow is not None:
+            return None, self.arrow.X
         return self.conic.form.barriers(*self.W, self.u, self.conic.problem.mean_diagonal, self.conic.within), None
 
     def direction(self, newton: Newton, w: Array, *earlier: Array) -> Direction:
         """The direction of the right-hand side w; ``earlier``: solutions of the Newton system to begin from."""
         problem, form, found = self.conic.problem, self.conic.form, self.found
-        c, f = lorentz.pulls(*self.W, self.at.s, self.at.z, self.u, w)
-        q = form.back(c) - found.r_y
-        alone = None if self.arrows is None else self.arrows.alone(f, found.r_y)
-        dg, x = newton.solve(q, self.tol, found.r_v, earlier, alone)
-        dv, ds = newton.system.momenta(x, dg, found.r_v), form.of(dg)
-        if self.arrows is not None:  # r_y vanishes, r_v takes the error of the linear solve
+        c, f = lorentz.right_hand_sides(*self.W, self.at.s, self.at.z, self.u, w)
+        q = form.transpose(c) - found.r_y
+        uncoupled = None if self.arrow is None else self.arrow.uncoupled(f, found.r_y)
+        dg, x = newton.solve(q, self.tol, found.r_v, earlier, uncoupled)
+        dv, ds = newton.system.momenta(x, dg, found.r_v), form.apply(dg)
+        if self.arrow is not None:  # r_y vanishes, r_v takes the error of the linear solve
             dy = problem.velocity_of(dv) + problem.compliance * dg + found.r_y
-            dy = self.arrows.split(dy, f, ds)
+            dy = self.arrow.dual_step(dy, f, ds)
         else:  # r_v vanishes, r_y takes it
-            dy = lorentz.less_inverse_squares(*self.W, self.u, c, ds)
+            dy = lorentz.subtract_inverse_squared(*self.W, self.u, c, ds)
         return Direction(ds, self._turned(dy), dy, dv, x)
 
     def _turned(self, dy: Array) -> Array:
@@ -271,17 +275,17 @@ class Scaled(NamedTuple):
         """The step to take, at most 1 and not up to the boundary."""
         return min(1.0, self.conic.boundary * self.reach(d))
 
-    def centred(self, d: Direction, target: float) -> Array:
+    def mehrotra_correction(self, d: Direction, target: float) -> Array:
         """The w of a direction that aims at s o z = target e, with the second-order term of the last direction."""
-        return lorentz.centring(*self.W, self.at.z, d.ds, d.dz, target)
+        return lorentz.mehrotra_correction(*self.W, self.at.z, d.ds, d.dz, target)
 
-    def towards_path(self, d: Direction, reach: float, target: float) -> Array:
+    def gondzio_correction(self, d: Direction, reach: float, target: float) -> Array:
         """What to add to w so that the eigenvalues of s o z, ``reach`` along the direction, come near the target, up
         to the factor ``spread``.
 
         Source: Gondzio (1996), multiple centrality corrections; here with the eigenvalues of second-order cones."""
         spread = self.conic.options.spread
-        return lorentz.towards_path(*self.W, self.at.z, d.ds, d.dz, reach, 1.0 / spread * target, spread * target)
+        return lorentz.gondzio_correction(*self.W, self.at.z, d.ds, d.dz, reach, 1.0 / spread * target, spread * target)
 
 
 def with_de_saxce(y: Array) -> Array:

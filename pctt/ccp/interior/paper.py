@@ -58,7 +58,7 @@ def solve(
         y, f, df = velocity(problem, g), constraints(g, mu), gradients(g, mu)
         errors = problem.errors(g, y)
         history.append(limits.residual(errors))
-        limits.tell(iteration, history[-1])
+        limits.report(iteration, history[-1])
         if history[-1] <= limits.tol:
             status, reason = Status.CONVERGED, limits.met
             break

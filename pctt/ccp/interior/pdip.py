@@ -32,6 +32,8 @@ from pctt.ccp.result import Limits, Result, Status
 from pctt.log import phase
 from pctt.options import FRACTION, number, option
 
+#: Steps after which the proximal term grows or shrinks by the factor; it is at most the factor.
+SHORT, LONG, FACTOR = 0.3, 0.7, 4.0
 PERSPECTIVE, PAPER = FORMS = ("perspective", "paper")
 
 
@@ -120,7 +122,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         # residuals
         errors = problem.errors(at.g, at.y)
         history.append(limits.residual(errors))
-        limits.tell(iteration, history[-1])
+        limits.report(iteration, history[-1])
         if history[-1] <= limits.tol:
             status, reason = Status.CONVERGED, limits.met
             break
@@ -138,7 +140,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         step = linear.step(direction)
         # corrected step, where the cones' curvature cuts Newton's short and the other is much longer
         if step < options.short:
-            other = linear.corrected(direction, min(1.0, step + options.reach))
+            other = linear.direction(*linear.second_order(direction, min(1.0, step + options.reach)))
             longer = linear.step(other)
             if longer > options.longer * step:
                 step, direction = longer, other
@@ -244,13 +246,13 @@ class Linearised(NamedTuple):
         dg[self.barrier.constraint.frictionless, 1:] = 0.0
         return Direction(dg, dlam[:, 0])
 
-    def corrected(self, d: Direction, reach: float) -> Direction:
-        """The direction with the terms that the linearised conditions lack at ``reach`` along another one, divided by
-        ``reach``: those of second order of sum lambda_i grad f_i (without third derivatives) and of lambda_i f_i. A
-        contact that slides has to turn its impulse along the cone, and straight steps leave it soon."""
+    def second_order(self, d: Direction, reach: float) -> tuple[Array, Array]:
+        """The terms that the linearised conditions lack at ``reach`` along a direction, divided by ``reach``: those of
+        second order of sum lambda_i grad f_i (without third derivatives) and of lambda_i f_i. A contact that slides has
+        to turn its impulse along the cone, and straight steps leave it soon."""
         turned = times(self.hessian, d.dg)
         missed = d.dlam * dot(self.df, d.dg) + 0.5 * self.at.lam * dot(d.dg, turned)
-        return self.direction(reach * d.dlam[:, None] * turned, reach * missed)
+        return reach * d.dlam[:, None] * turned, reach * missed
 
     def step(self, d: Direction) -> float:
         """Longest step, at most 1, inside the cones, near the central path; nan if the direction is no number."""
@@ -277,6 +279,6 @@ def _next_damping(damping: float, step: float, natural: float, options: PDIP) ->
     is less than the natural residual shows. Early, impulses may have to grow by orders of magnitude: there is none."""
     if natural > options.late:
         return 0.0
-    if step < 0.3:
-        return min(max(1.0, 4.0 * damping), 4.0)
-    return damping / 4.0 if step > 0.7 else damping
+    if step < SHORT:
+        return min(max(1.0, FACTOR * damping), FACTOR)
+    return damping / FACTOR if step > LONG else damping

@@ -132,7 +132,7 @@ class Comparison:
     def _solver(self, name: str) -> Krylov:
         if name not in self._krylov:
             kind = self.kinds[name]
-            self._krylov[name] = Krylov(self.comm, OWN + prefix(name), NAMED.get(kind, {"pc_type": kind}))
+            self._krylov[name] = Krylov(self.comm, OWN + prefix(name), NAMED.get(kind, {"pc_type": kind}), timed=True)
         return self._krylov[name]
 
     def forget(self) -> None:

@@ -4,20 +4,24 @@ barrier blocks after another. Both have
     problem : the cone problem
     matrix : the system's matrix, a function; it is positive definite where it is symmetric
     symmetric : whether the present matrix is
-    mends : whether the residual of a solve is one of momenta, dv = G' dg - r_v, which the next step of a method with
-        momenta of its own mends; or it is one of velocities, (B + C) dg + G dv = q, where it opens what should touch
+    error_in_momenta : whether the residual of a solve is one of momenta, dv = G' dg - r_v, which the next step of a
+        method with momenta of its own mends; or it is one of velocities, (B + C) dg + G dv = q, where it opens what
+        should touch
     speed : what a residual of 1 changes the velocities of contacts by, about
 
-and the functions of `ContactForm`. `FewForm` is that of the contacts with factors of its own, and
-`pctt.ccp.newton.kkt.KKTForm` has the multipliers as unknowns too.
+and the functions of `ContactForm`. `GivenForm` is that of contacts without bodies, and `pctt.ccp.newton.kkt.KKTForm`
+has the multipliers as unknowns too.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Union
 
 import numpy as np
+import scipy.sparse as sp
 from petsc4py import PETSc
 
 from dem.contact_map.loops import local_product, pack
@@ -25,12 +29,43 @@ from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shel
 from pctt.body_matrix import BodyOperator, inverse_blocks
 from pctt.ccp.cones import Array
 from pctt.ccp.delassus import GivenMatrix
-from pctt.ccp.newton.few import Factors, Order
-from pctt.ccp.newton.fronts import Dissection, Fronts
+from pctt.ccp.newton.defaults import DIRECT, MULTIFRONTAL, Options
+from pctt.ccp.newton.elimination import Order
+from pctt.ccp.newton.kkt import KKT
+from pctt.ccp.newton.krylov import Source
+from pctt.ccp.newton.multifrontal import Dissection, MultifrontalFactors
 from pctt.ccp.problem import ConeProblem
 
 
-class ContactForm:
+class Form:
+    """A form makes the systems of a method with constraints and multipliers too (`pctt.ccp.newton.kkt.KKT`): it
+    eliminates the multipliers, unless it says otherwise."""
+
+    update: Callable[..., None]
+    right_hand_side: Callable[..., Array]
+    impulses: Callable[..., Array]
+
+    def fits(self, kkt: KKT) -> bool:
+        """Whether the matrix can take the values of these constraints."""
+        return True
+
+    def linearise(self, kkt: KKT) -> None:
+        """Make the matrix of a method with constraints."""
+        self.kkt = kkt
+        self.update(kkt.schur())
+
+    def right_side(self, r_g: Array, r_lam: Array) -> Array:
+        """Of the system for x, for the right-hand side r_g (nc, 3), r_lam (nc, k) of `KKT`."""
+        self._q = self.kkt.reduced(r_g, r_lam)
+        return self.right_hand_side(self._q, None, None)
+
+    def changes(self, x: Array, r_lam: Array) -> tuple[Array, Array]:
+        """dg and dlam of a solution for the last `right_side`."""
+        dg = self.impulses(x, self._q, None)
+        return dg, self.kkt.multipliers(dg, r_lam)
+
+
+class ContactForm(Form):
     """The Newton system of the contacts, S = N + C + B (3Nc x 3Nc, block size 3): the paper's Schur complement.
 
         S dg = q + G r_v,    dv = G' dg - r_v.
@@ -41,15 +76,24 @@ class ContactForm:
     with the full diagonal blocks.
     """
 
-    mends = False
+    error_in_momenta = False
     speed = 1.0
 
     def __init__(self, problem: ConeProblem):
         self.problem, self.symmetric = problem, True
         self._entries: PETSc.Mat | None = None
+        self._current = True
+
+    @property
+    def matrix(self) -> PETSc.Mat:
+        """With the present values; no object of PETSc is made before it is asked for."""
+        if not self._current:
+            self._current = True
+            self._take_values()
+        return self._mat
 
     @cached_property
-    def matrix(self) -> PETSc.Mat:
+    def _mat(self) -> PETSc.Mat:
         return symmetric_shell(self.problem.comm, self.problem.r.size, 3, self._product)
 
     def load(self, problem: ConeProblem) -> None:
@@ -60,10 +104,13 @@ class ContactForm:
         """Make the matrix for the barrier blocks B (nc, 3, 3), or from ``inverse`` = (B + C)^-1 if the caller has it
         more accurately. ``symmetric`` says whether the blocks are."""
         assert barrier is not None
-        self._blocks, self._made, self.symmetric = self.problem.diagonal_blocks + barrier, False, symmetric
-        self._local = np.empty((len(barrier), 6))
-        pack(barrier + self.problem.compliance_blocks, self._local)
-        set_diagonal_blocks(self.matrix, self._blocks)
+        self.blocks, self._made, self.symmetric = self.problem.diagonal_blocks + barrier, False, symmetric
+        self._barrier, self._current = barrier, False
+
+    def _take_values(self) -> None:
+        self._local = np.empty((len(self._barrier), 6))
+        pack(self._barrier + self.problem.compliance_blocks, self._local)
+        set_diagonal_blocks(self._mat, self.blocks)
 
     def _product(self, g: Array, out: Array) -> None:
         g, out = g.reshape(-1, 3), out.reshape(-1, 3)
@@ -72,13 +119,13 @@ class ContactForm:
         self.problem.operator.add_delassus(g, out)
 
     def entries(self) -> PETSc.Mat:
-        """S without the columns of hubs (BAIJ), with the places and names of the contacts that preconditioners may have
+        """S without dense columns of G (BAIJ), with the places and names of the contacts that preconditioners may have
         as attributes; collective."""
         if self._entries is None or not self._loaded:
             self._entries = self._with_N(self._entries)
         self._loaded = True
         if not self._made:
-            put_diagonal_blocks(self._entries, self._blocks)
+            put_diagonal_blocks(self._entries, self.blocks)
             for name, value in (("coordinates", self.problem.point), ("key", self.problem.key)):
                 if value is not None:
                     self._entries.setAttr(name, value)
@@ -106,38 +153,41 @@ class ContactForm:
         """dv (6m,) of a solution with the impulses dg."""
         return self.problem.momentum(dg) - r_v
 
+    @property
+    def factored_by(self) -> Options:
+        """Options of the solver that makes factors."""
+        return DIRECT[self.symmetric]
+
+    @contextmanager
+    def to_factor(self, least: float) -> Iterator[Source]:
+        """What is to be factorised."""
+        yield self.entries
+
     def destroy(self) -> None:
-        if "matrix" in self.__dict__:
-            self.matrix.destroy()
+        if "_mat" in self.__dict__:
+            self._mat.destroy()
         if self._entries is not None:
             self._entries.destroy()
 
 
-class FewForm(ContactForm):
-    """The form of the contacts where a problem, given by N, has few of them on one rank: `Factors` solve it, and no
-    object of PETSc is made before these have failed."""
+class GivenForm(ContactForm):
+    """The form of few contacts, of a problem that is given by N: its momenta are impulses, and r_v is rounding. It has
+    an ``order`` of elimination."""
 
     def __init__(self, problem: ConeProblem, order: Order):
-        self._order = order
         super().__init__(problem)
+        assert isinstance(problem.operator, GivenMatrix)
+        self.order = order
 
-    def update(self, barrier: Array | None, inverse: Array | None = None, symmetric: bool = True) -> None:
-        assert barrier is not None
-        assert isinstance(self.problem.operator, GivenMatrix)
-        self._barrier, self.symmetric = barrier, symmetric
-        blocks = self.problem.diagonal_blocks + barrier
-        self.factors = Factors(self.problem.operator.local, self._order, blocks, symmetric)
+    @property
+    def N(self) -> sp.bsr_matrix:  # noqa: N802 - as in formulas
+        return self.problem.operator.local  # type: ignore[union-attr]
 
     def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
-        """q: momenta are impulses here, and r_v is rounding."""
         return q.ravel()
 
-    def update_matrix(self) -> None:
-        """Make the matrix for the present blocks."""
-        super().update(self._barrier, None, self.symmetric)
 
-
-class BodyForm:
+class BodyForm(Form):
     """The Newton system of the bodies, K = I + G' (B + C)^-1 G (6M x 6M, block size 6), in mass-scaled velocities: the
     Schur complement of the bodies.
 
@@ -149,7 +199,7 @@ class BodyForm:
     For Coulomb's law (B + C)^-1 is not symmetric, and K is not either. With moments its blocks are (nc, 6, 6).
     """
 
-    mends = True
+    error_in_momenta = True
 
     def __init__(self, problem: ConeProblem):
         assert problem.contact_map is not None
@@ -189,15 +239,21 @@ class BodyForm:
             self._places = self.operator.entries().places(self.problem.point)
         return self._places
 
-    def stiff_part(self, least: float) -> PETSc.Mat:
-        """K without blocks below ``least`` (`BodyMatrix.stiff_part`), in scalar rows: a new Mat, which the caller
-        destroys."""
-        return self.operator.entries().stiff_mat(least, self.symmetric)
+    @property
+    def factored_by(self) -> Options:
+        return MULTIFRONTAL if self.symmetric else DIRECT[False]
 
-    def fronts(self, least: float, precision: type[np.floating]) -> Fronts:
+    @contextmanager
+    def to_factor(self, least: float) -> Iterator[Source]:
+        """K without blocks below ``least`` (`BodyMatrix.stiff_part`), in scalar rows."""
+        part = self.operator.entries().stiff_mat(least, self.symmetric)
+        yield part
+        part.destroy()  # the KSP keeps it
+
+    def fronts(self, least: float, precision: type[np.floating]) -> MultifrontalFactors:
         """The factors of this part, which is symmetric; all of a problem in the order of the first. Collective."""
         part = self.operator.entries().stiff_part(least)
-        fronts = Fronts(self.problem.comm, part, self.places(), precision, self._dissection)
+        fronts = MultifrontalFactors(self.problem.comm, part, self.places(), precision, self._dissection)
         self._dissection = fronts.dissection
         return fronts
 
@@ -223,4 +279,4 @@ class BodyForm:
         self.operator.destroy()
 
 
-NewtonForm = Union[ContactForm, BodyForm]
+System = Union[ContactForm, BodyForm]

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Protocol, Union, runtime_checkable
+from typing import Any, Protocol, Union, runtime_checkable
 
 import numpy as np
 from mpi4py import MPI
@@ -25,6 +25,8 @@ _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
 _BY_PRODUCTS = {"none", "jacobi", "pbjacobi"}  # these need no entries beside the diagonal blocks
 _IN_BLOCKS = {*_BY_PRODUCTS, "ilu", "icc", "python"}  # others get scalar rows, as PETSc has no block code for all
 _FACTORS = {"cholesky", "lu"}
+#: Seconds until a rank ends the run whose KSP has failed alone: the others are in calls that wait for it for ever.
+PATIENCE = 60.0
 WITHIN = "within each rank"
 _WITHIN_RANKS = {"bjacobi", "sor", "eisenstat"}  # of several ranks each works on its own rows
 _NAMES = {"bcgs": "BiCGStab", "cg": "CG", "gmres": "GMRES", "fgmres": "FGMRES", "minres": "MINRES"}
@@ -38,7 +40,7 @@ _REASONS = {
 
 
 @runtime_checkable
-class Telling(Protocol):
+class Reporting(Protocol):
     """A python preconditioner that tells of itself, as those of the project do: its name for ``-pc_python_type``, lines
     for ``-ksp_view``, and in a few words what it really was over its solves."""
 
@@ -64,7 +66,7 @@ class Solve:
 
 
 class Krylov:
-    """KSP with options prefix ``prefix``; ``defaults`` are PETSc options that the user's own replace.
+    """A Krylov method is a KSP with the options prefix ``prefix``; the user's options replace the ``defaults``.
 
     Without options: BiCGStab, preconditioned from the right by the inverses of the diagonal blocks, to a
     relative residual of ``rtol`` in at most 1000 iterations (the paper's cap). On several ranks ILU and ICC
@@ -73,8 +75,12 @@ class Krylov:
     once a system is solved with them.
     """
 
-    def __init__(self, comm: MPI.Comm, prefix: str = OWN, defaults: dict[str, str] | None = None, rtol: float = 1e-3):
-        self.comm, self.prefix = comm, prefix
+    def __init__(
+        self, comm: MPI.Comm, prefix: str = OWN, defaults: dict[str, str] | None = None, rtol: float = 1e-3,
+        timed: bool = False,
+    ):  # fmt: skip
+        """``timed``: ranks wait for each other, so that the seconds of a `Solve` are those of all."""
+        self.comm, self.prefix, self.timed = comm, prefix, timed
         similar = {"pc_tt_reuse": "trains"}  # the matrices are alike
         self._options, self._sources = to_enter(prefix, similar | (defaults or {}), comm.size)
         self.ksp = PETSc.KSP().create(comm)
@@ -127,21 +133,29 @@ class Krylov:
         if rtol is not None and not self._rtol_is_given:
             self.rtol = float(rtol)
             self.ksp.setTolerances(rtol=self.rtol)
-        start = _now(self.comm)
+        start = self._now()
         mark_used(self._read)
         with self._entered():
-            error = on_all_ranks(self.comm, lambda: self._set_up(A, P, keep))
-            setup = _now(self.comm)
-            error = error or on_all_ranks(self.comm, lambda: self._iterate(b, x), patience=60.0)
-        if error:
+            with OnAllRanks(self.comm) as done:
+                self._set_up(A, P, keep)
+            setup = self._now()
+            if not done.error:
+                x.zeroEntries()
+                right_hand_side = b.copy()  # an error of PETSc may leave it locked
+                with OnAllRanks(self.comm, PATIENCE) as done:
+                    self.ksp.solve(right_hand_side, x)
+                right_hand_side.destroy()
+        if done.error:
             self.forget()
             x.zeroEntries()
-            return Solve(False, f"PETSc error {error}", 0, 0.0, 0.0, 1.0, self.rtol)
+            return Solve(False, f"PETSc error {done.error}", 0, 0.0, 0.0, 1.0, self.rtol)
         reason, iterations = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
-        end = _now(self.comm)
+        end = self._now()
         if reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
             self._reset()  # else MUMPS, once failed, fails for every later matrix
-        true = _true_residual(A, b, x)
+        residual = b.duplicate()
+        A.mult(x, residual)
+        true = _part_left(residual, b, x)
         # twice: BiCGStab's recursive residual may drift a little without harm
         converged = reason > 0 and true <= 2 * self.rtol
         words = _REASONS.get(reason, str(reason))
@@ -176,12 +190,6 @@ class Krylov:
         self.ksp.setUp()
         self.ksp.setUpOnBlocks()
 
-    def _iterate(self, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        x.zeroEntries()
-        right_hand_side = b.copy()  # an error of PETSc may leave it locked
-        self.ksp.solve(right_hand_side, x)
-        right_hand_side.destroy()
-
     @property
     def needs_entries(self) -> bool:
         """Whether the preconditioner reads entries beside the diagonal blocks."""
@@ -215,14 +223,18 @@ class Krylov:
         return block_diagonal(P) if self.kind == "pbjacobi" else None
 
     @property
-    def own(self) -> Telling | None:
+    def own(self) -> Reporting | None:
         """The preconditioner, if it is one that tells of itself."""
+        return self._context if isinstance(self._context, Reporting) else None
+
+    @property
+    def _context(self) -> Any:
+        """The object of Python that is the preconditioner, or None."""
         pc = self.ksp.pc
-        context = pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
-        return context if isinstance(context, Telling) else None
+        return pc.getPythonContext() if pc.getType() == PETSc.PC.Type.PYTHON else None
 
     def report(self) -> list[str]:
-        """What a preconditioner that is `Telling` says of itself and its fallbacks, as in ``-ksp_view``."""
+        """What a preconditioner that is `Reporting` says of itself and its fallbacks, as in ``-ksp_view``."""
         return self.own.report() if self.own else []
 
     def what(self) -> str:
@@ -233,10 +245,17 @@ class Krylov:
 
     def words(self) -> str:
         """Krylov method and preconditioner."""
-        own, right = self.own, self.ksp.getPCSide() == PETSc.PC.Side.RIGHT
+        own, right, name = self.own, self.ksp.getPCSide() == PETSc.PC.Side.RIGHT, self._pc_name
+        if (context := self._context) is not None:  # the class as -pc_python_type has it
+            name = own.name if own else f"{type(context).__module__}.{type(context).__qualname__}"
         remark = f" {WITHIN}" if not own and self.what() else ""
         method = _NAMES.get(self.method, self.method) + " (right)" * right
-        return f"{method}, {own.name if own else self._pc_name}{remark}"
+        return f"{method}, {name}{remark}"
+
+    def _now(self) -> float:
+        if self.timed and self.comm.size > 1:
+            self.comm.Barrier()  # a phase lasts until its slowest rank
+        return time.perf_counter()
 
     def forget(self) -> None:
         """Prepare for a matrix of another structure. A python preconditioner keeps the data that may serve it too."""
@@ -257,10 +276,9 @@ def _continued(viewer: str | None) -> str | None:
     return ":".join([*parts, ""][:3] + ["append"]) if len(parts) in (2, 3) and parts[1] else viewer
 
 
-def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
-    """||b - S x|| / ||b||; an x that is no number is replaced by zero, and leaves 1."""
-    residual = b.duplicate()
-    S.mult(x, residual)
+def _part_left(product: PETSc.Vec, b: PETSc.Vec, x: PETSc.Vec) -> float:
+    """||b - S x|| / ||b|| of the product S x, which is destroyed; an x that is no number becomes zero, and leaves 1."""
+    residual = product
     residual.aypx(-1.0, b)
     norm, reference = residual.norm(), b.norm()
     residual.destroy()
@@ -270,35 +288,44 @@ def _true_residual(S: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec) -> float:
     return norm / reference if reference > 0 else norm
 
 
-def _now(comm: MPI.Comm) -> float:
-    if comm.size > 1:
-        comm.Barrier()  # a phase lasts until its slowest rank
-    return time.perf_counter()
-
-
-def on_all_ranks(comm: MPI.Comm, work: Callable[[], None], patience: float = np.inf) -> int:
-    """Do some work on all ranks. Returns 0, or on all ranks PETSc's error code if the work failed on one or more.
+class OnAllRanks:
+    """A block that ends alike on all ranks: ``error`` is then 0, or PETSc's error code if it failed on one or more.
 
     A rank that fails alone waits for the others, which may still factorise blocks of their own. It cannot call them
-    back from a collective call of PETSc. Where the work is nothing but such calls, it ends the run after ``patience``
+    back from a collective call of PETSc. Where the block is nothing but such calls, it ends the run after ``patience``
     seconds, with a message."""
-    code = np.zeros(1, int)
-    words = ""
-    try:
-        with own_errors():
-            work()
-    except PETSc.Error as error:
-        code[0], words = abs(error.ierr) or 1, str(error)
-    if comm.size == 1:
-        return int(code[0])
-    worst = np.empty(1, int)
-    meeting = comm.Iallreduce(code, worst, op=MPI.MAX)
-    deadline = time.monotonic() + patience
-    while code[0] and not meeting.Test():
-        if time.monotonic() > deadline:
-            sys.stderr.write(f"pctt: rank {comm.rank} failed alone: {words}\n")
-            sys.stderr.flush()
-            comm.Abort(1)
-        time.sleep(0.01)
-    meeting.Wait()
-    return int(worst[0])
+
+    def __init__(self, comm: MPI.Comm, patience: float = np.inf):
+        self.comm, self.patience, self.error = comm, patience, 0
+
+    def __enter__(self) -> OnAllRanks:
+        self._errors = own_errors()
+        self._errors.__enter__()
+        return self
+
+    def __exit__(self, *raised: Any) -> bool:
+        error, words = raised[1], ""
+        try:
+            self._errors.__exit__(*raised)
+        except PETSc.Error as other:
+            error = other
+        if isinstance(error, PETSc.Error):
+            self.error, words = abs(error.ierr) or 1, str(error)
+        elif error is not None:
+            return False
+        if self.comm.size > 1:
+            self._meet(words)
+        return True
+
+    def _meet(self, words: str) -> None:
+        worst = np.empty(1, int)
+        meeting = self.comm.Iallreduce(np.array([self.error]), worst, op=MPI.MAX)
+        deadline = time.monotonic() + self.patience
+        while self.error and not meeting.Test():
+            if time.monotonic() > deadline:
+                sys.stderr.write(f"pctt: rank {self.comm.rank} failed alone: {words}\n")
+                sys.stderr.flush()
+                self.comm.Abort(1)
+            time.sleep(0.01)
+        meeting.Wait()
+        self.error = int(worst[0])

@@ -33,7 +33,7 @@ from pctt.body_matrix import Part
 from pctt.petsc import Context
 
 LEAF = 16  # bodies of a part that is not cut further; 40 take as long
-HUB = 100  # neighbours of a body that is ordered last: such bodies touch both halves of nearly every cut
+DENSE = 100  # neighbours of a body that is ordered last: such bodies touch both halves of nearly every cut
 SHIFT = 1.0  # added to the scaled diagonal, in units of rounding; a tenth breaks down, ten times take more iterations
 ONE = np.float32(1.0)
 Out = TypeVar("Out")
@@ -89,7 +89,7 @@ class Dissection(NamedTuple):
 Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 
 
-class Fronts:
+class MultifrontalFactors:
     """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted; collective. LinAlgError or
     MemoryError on all ranks if such a block of any is not positive definite, or one has no room.
 
@@ -302,8 +302,8 @@ def dissected(points: Array, row: np.ndarray, column: np.ndarray, ranks: int = 1
     count = len(points)
     name, group = np.zeros((2, count), np.int64)  # of a front: a digit for each level, 0 and 1 the halves, 2 between
     neighbours = np.bincount(row, minlength=count) + np.bincount(column, minlength=count)
-    active = (neighbours > 0) & (neighbours <= HUB)
-    name[neighbours > HUB], name[neighbours == 0] = HUBS, -1
+    active = (neighbours > 0) & (neighbours <= DENSE)
+    name[neighbours > DENSE], name[neighbours == 0] = HUBS, -1
     for level in range(LEVELS):
         _, part, sizes = np.unique(group[active], return_inverse=True, return_counts=True)
         active[active] = sizes[part] > LEAF
@@ -383,12 +383,12 @@ def places_in(count: int, row: np.ndarray, column: np.ndarray) -> Array:
     return places
 
 
-class FrontPC(Context):
-    """The PC of the `Fronts` that ``make`` makes; the one who makes the PC sets it, for each matrix."""
+class MultifrontalPC(Context):
+    """The PC of the `MultifrontalFactors` that ``make`` makes; the one who makes the PC sets it, for each matrix."""
 
     without = PETSc.PC.Type.NONE
-    make: Callable[[], Fronts]
-    fronts: Fronts | None = None
+    make: Callable[[], MultifrontalFactors]
+    fronts: MultifrontalFactors | None = None
 
     def setUp(self, pc: PETSc.PC) -> None:
         self.fronts = None  # first, as it may fill the memory

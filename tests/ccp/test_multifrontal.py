@@ -10,8 +10,8 @@ from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from pctt.body_matrix import Part
-from pctt.ccp.newton import fronts
-from pctt.ccp.newton.fronts import Fronts, dissected, separated
+from pctt.ccp.newton import multifrontal
+from pctt.ccp.newton.multifrontal import MultifrontalFactors, dissected, separated
 
 SELF = MPI.COMM_SELF
 
@@ -57,7 +57,7 @@ def test_the_factors_solve(precision, accuracy, hub, known):
     that has no bodies."""
     comm, (part, points) = MPI.COMM_WORLD, stiff(hub=hub)
     rows, here = rows_of(part, comm)
-    factors = Fronts(comm, rows, points[here] if known else None, precision)
+    factors = MultifrontalFactors(comm, rows, points[here] if known else None, precision)
     x = np.random.default_rng(1).standard_normal((len(points), 6))
     found = factors.solve((dense(part) @ x.ravel()).reshape(-1, 6)[here].ravel())
     assert np.linalg.norm(found - x[here].ravel()) <= accuracy * np.linalg.norm(x)
@@ -71,7 +71,7 @@ def test_a_matrix_that_rounding_has_made_indefinite_gets_a_larger_diagonal():
     blocks = part.blocks.copy()
     row = np.repeat(np.arange(len(points)), np.diff(part.indptr))
     blocks[row == part.indices] *= 1 - 1e-4
-    factors = Fronts(SELF, part._replace(blocks=blocks), points)
+    factors = MultifrontalFactors(SELF, part._replace(blocks=blocks), points)
     assert np.isfinite(factors.solve(np.ones(6 * len(points)))).all()
 
 
@@ -82,14 +82,14 @@ def test_where_one_rank_fails_all_know():
     row = np.repeat(np.arange(here.start, here.stop), np.diff(rows.indptr))
     rows.blocks[(row == rows.indices) & (row == len(points) - 1)] *= -1.0  # of the last rank
     with pytest.raises(np.linalg.LinAlgError):
-        Fronts(comm, rows, points[here])
+        MultifrontalFactors(comm, rows, points[here])
 
 
 def test_nothing_to_factorise():
     empty = Part(np.zeros(1, int), np.zeros(0, int), np.zeros((0, 6, 6)))
-    assert Fronts(SELF, empty, np.zeros((0, 3))).solve(np.zeros(0)).shape == (0,)
+    assert MultifrontalFactors(SELF, empty, np.zeros((0, 3))).solve(np.zeros(0)).shape == (0,)
     alone = Part(np.arange(3), np.arange(2), np.tile(2 * np.eye(6), (2, 1, 1)))
-    np.testing.assert_allclose(Fronts(SELF, alone, np.zeros((2, 3))).solve(np.ones(12)), 0.5, rtol=1e-6)
+    np.testing.assert_allclose(MultifrontalFactors(SELF, alone, np.zeros((2, 3))).solve(np.ones(12)), 0.5, rtol=1e-6)
 
 
 def test_separators_separate():
@@ -106,7 +106,7 @@ def test_separators_separate():
     assert sizes[-1] <= side**2
     front = np.empty(side**3, int)
     front[order] = np.repeat(np.arange(len(sizes)), sizes)
-    leaves = sizes[front[pairs]].max(axis=1) <= fronts.LEAF
+    leaves = sizes[front[pairs]].max(axis=1) <= multifrontal.LEAF
     assert np.count_nonzero(front[pairs[:, 0]] == front[pairs[:, 1]]) > 0
     assert leaves.any()
 
@@ -116,7 +116,7 @@ def test_a_separator_is_the_smallest_of_the_middle():
     subsets = ((np.arange(1 << 8)[:, None] >> np.arange(8)) & 1).astype(bool)
     for _ in range(20):
         place = (np.arange(12) + 0.5) / 12
-        middle = np.flatnonzero(np.abs(place - 0.5) <= fronts.BAND)
+        middle = np.flatnonzero(np.abs(place - 0.5) <= multifrontal.BAND)
         low, high = np.arange(middle[0]), np.arange(middle[-1] + 1, 12)
         pairs = np.sort(rng.integers(0, 12, (20, 2)), axis=1)
         ends = np.isin(pairs[:, 0], low) & np.isin(pairs[:, 1], high)  # no body of the middle keeps these apart
@@ -153,10 +153,10 @@ def test_a_dissection_of_weaker_ties_does_not_join_the_parts_of_two_ranks():
     kept = (row == part.indices) | ((row + part.indices) % 3 > 0)
     less = Part(np.r_[0, np.cumsum(np.bincount(row[kept]))], part.indices[kept], part.blocks[kept])
     (few, here), (every, _) = rows_of(less, comm), rows_of(part, comm)
-    given = Fronts(comm, few, points[here]).dissection
+    given = MultifrontalFactors(comm, few, points[here]).dissection
     assert given.fits(row[kept], less.indices)
     assert not given.fits(row, part.indices)
-    factors = Fronts(comm, every, points[here], np.float64, given)
+    factors = MultifrontalFactors(comm, every, points[here], np.float64, given)
     assert factors.dissection is not given
     x = np.random.default_rng(1).standard_normal((len(points), 6))
     found = factors.solve((dense(part) @ x.ravel()).reshape(-1, 6)[here].ravel())
@@ -171,9 +171,9 @@ def test_a_dissection_serves_the_next_matrix_too(fits):
     near = (row == part.indices) | ((row < 200) & (part.indices < 200) if fits else (row < 100) & (part.indices < 100))
     less = Part(np.r_[0, np.cumsum(np.bincount(row[near]))], part.indices[near], part.blocks[near])
     first, other = (part, less) if fits else (less, part)
-    given = Fronts(SELF, first, points).dissection
+    given = MultifrontalFactors(SELF, first, points).dissection
     assert given.fits(np.repeat(np.arange(len(points)), np.diff(other.indptr)), other.indices) == fits
-    factors = Fronts(SELF, other, points, np.float64, given)
+    factors = MultifrontalFactors(SELF, other, points, np.float64, given)
     assert (factors.dissection is given) == fits
     x = np.random.default_rng(1).standard_normal(6 * len(points))
     np.testing.assert_allclose(factors.solve(dense(other) @ x), x, atol=1e-8)

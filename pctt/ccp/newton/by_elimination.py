@@ -1,0 +1,98 @@
+"""Newton systems of few contacts on one rank by the project's own choice: elimination by blocks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from pctt.ccp.cones import Array
+from pctt.ccp.delassus import GivenMatrix, all_blocks
+from pctt.ccp.newton.by_ksp import ByKSP
+from pctt.ccp.newton.defaults import GIVEN
+from pctt.ccp.newton.elimination import Factors, Order, ordered
+from pctt.ccp.newton.factor import Room
+from pctt.ccp.problem import ConeProblem
+
+FEW = 1000  # contacts up to which an order of elimination is looked for
+PAIRS = 100_000  # pairs of blocks in an elimination at most: 20 ns each
+REST = 133  # contacts in the dense rest at most: 1 ms
+
+
+def eliminated(problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:
+    """N and an order of elimination of a problem on one rank; None if it has many contacts, or none is cheap."""
+    if not (problem.comm.size == problem.cones.parts == 1 and problem.size <= FEW and problem.has_entries):
+        return None
+    if isinstance(problem.operator, GivenMatrix):
+        known = problem.operator
+    else:
+        assert problem.contact_map is not None
+        G = problem.contact_map.block_rows
+        if np.square(np.bincount(G.indices)).sum() > 2 * PAIRS + len(G.indices):
+            return None
+        known = GivenMatrix(problem.comm, all_blocks(G))
+    order = ordered(known.local.indptr, known.local.indices, PAIRS, REST)
+    return None if order is None else (known, order)
+
+
+class ByElimination:
+    """`Factors` in one order for all matrices of a structure. Where a solve fails a KSP takes over, and no object of
+    PETSc is made before."""
+
+    takes_unsymmetric = True
+    readers: Sequence[str] = ()
+    remark = ""
+
+    def __init__(self, comm: MPI.Comm, room: Room):
+        self.ksp = ByKSP(comm, room, GIVEN)
+        self.begin()
+
+    def begin(self) -> None:
+        """Another problem."""
+        self.ksp.begin()
+        self._solves = 0
+
+    def factor(self, system: Any) -> None:
+        """The system has new values."""
+        self.system = system
+        self._factors = Factors(system.N, system.order, system.blocks, system.symmetric)
+
+    def solve(self, b: Array, wanted: float, earlier: Sequence[Array]) -> Array:
+        x, count = self._factors.solve(b.reshape(-1, 3), max(wanted, 1e-14 * math.sqrt(b @ b)))
+        self._solves += count
+        if count:
+            return x.ravel()
+        self.ksp.factor(self.system)
+        return self.ksp.solve(b, wanted, earlier)
+
+    @property
+    def iterations(self) -> int:
+        return self._solves + self.ksp.iterations
+
+    @property
+    def fallbacks(self) -> int:
+        return self.ksp.fallbacks
+
+    @property
+    def systems(self) -> int:
+        return self.ksp.systems
+
+    def words(self) -> str:
+        """How systems are solved."""
+        return "elimination by blocks"
+
+    def what(self) -> str:
+        return self.ksp.what()
+
+    def report(self) -> list[str]:
+        return self.ksp.report()
+
+    def forget(self) -> None:
+        """The next matrix has another structure."""
+        self.ksp.forget()
+
+    def destroy(self) -> None:
+        self.ksp.destroy()
