@@ -18,7 +18,7 @@ show. All quantities are in SI units.
 """
 
 __all__ = [
-    "analysis", "bodies", "checks", "contact", "contact_law", "contact_map", "experiment", "impulses", "joints", "loads",
-    "measures", "mesh", "motion", "neighbourhood", "packing", "partition", "record", "scene", "scenes", "shapes",
-    "sources", "springs", "start", "step", "stiffness", "system", "time_step", "world",
+    "analysis", "bodies", "checks", "contact", "contact_law", "contact_map", "experiment", "impulses",
+    "joints", "loads", "measures", "mesh", "motion", "neighbourhood", "packing", "partition", "record", "scene",
+    "scenes", "shapes", "sources", "springs", "start", "step", "stiffness", "system", "time_step", "world",
 ]  # fmt: skip
