@@ -18,7 +18,8 @@ from dem import quaternion
 from dem.arrays import Floats
 from dem.bodies import CLUMP
 from dem.compiled import loop
-from dem.shapes import Clump, Form, principal
+from dem.forms import Form
+from dem.shapes import Clump, principal
 
 CELLS = 1000
 

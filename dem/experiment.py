@@ -1,7 +1,7 @@
 """The interface between a scene and the program: options, recommended numerics, bodies, quantities to record.
 
-A scene of one's own is a class derived from `Experiment`; docs/tutorial.md writes one. The scenes of the package,
-`dem.scenes`, are written in the same way and need nothing else.
+A scene of one's own is a class derived from `Experiment`; docs/tutorial.md writes one. The scenes of the package
+(`-scene NAME`) are written in the same way and need nothing else.
 """
 
 from __future__ import annotations

@@ -14,7 +14,8 @@ from dem import quaternion
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.bodies import POLYHEDRON
 from dem.checks import finite
-from dem.shapes import Form, principal
+from dem.forms import Form
+from dem.shapes import principal
 
 #: Vertices of a polyhedron: contacts are known by pairs of edges, and the search tries all of them.
 MOST_VERTICES = 32

@@ -24,12 +24,13 @@ from dem import bodies, checks, clumps, contact_law, polyhedra, quaternion, shap
 from dem.arrays import ArrayLike, Floats, Ints, Rule
 from dem.bodies import BOX, CAPSULE, COMPOUND, MESH, PLANE, SPHERE, Bodies
 from dem.contact_law import ContactLaw
+from dem.forms import Form
 from dem.joints import Joint, whole_periods
 from dem.loads import Law, Load, On
 from dem.measures import Block, Cylinder
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
 from dem.quaternion import across, length
-from dem.shapes import Clump, Form, Shape
+from dem.shapes import Clump, Shape
 from dem.sources import MOST_IDS, Outlet, Source
 from dem.springs import End, Spring
 from dem.survey import Survey, survey

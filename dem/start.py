@@ -16,10 +16,10 @@ from dem.changes import refuse_load
 from dem.contact import find_contacts
 from dem.contact.primitives import refuse_untouchable
 from dem.exchange import exchange, refuse
+from dem.forms import Form
 from dem.partition import redistribute
 from dem.period import put_back, velocity_in_cell, wrapped
 from dem.scene import Scene, least_half
-from dem.shapes import Form
 from dem.sources import Tally, from_array
 from dem.step import follow_motions
 from dem.world import Servo, Shear, World

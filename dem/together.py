@@ -113,7 +113,7 @@ def _place(error: BaseException) -> str:
     frames = [
         (frame.f_code.co_filename, line)
         for frame, line in traceback.walk_tb(error.__traceback__)
-        if frame.f_globals.get("__name__", "").startswith((SCENE_FILE, "dem.scenes."))
+        if (name := frame.f_globals.get("__name__", "")).startswith(SCENE_FILE) or ".scenes." in name
     ]
     return f"{frames[-1][0]}, line {frames[-1][1]}: " if frames else ""
 

@@ -13,11 +13,11 @@ from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.contact_law import ContactLaw
+from dem.forms import Form
 from dem.joints import Joint
 from dem.loads import Load
 from dem.motion import Dynamic, Fixed, Pose, checked_pose, velocity_between
 from dem.scene import LargeBody
-from dem.shapes import Form
 from dem.sources import Outlet, Source, Tally, as_array
 from dem.springs import Spring
 from dem.together import together

@@ -12,7 +12,7 @@ from dem.arrays import Floats, Ints
 from dem.bodies import CLUMP, PLANE, POLYHEDRON, Bodies
 from dem.clumps import ClumpForm
 from dem.compiled import inlined, loop
-from dem.shapes import Form
+from dem.forms import Form
 
 
 class Members(NamedTuple):

@@ -23,8 +23,8 @@ import numpy as np
 from dem.arrays import Floats, Ints
 from dem.compiled import loop
 from dem.contact.narrow import CORNERS, Manifold, Planes, Spheres, Touch
+from dem.forms import Form
 from dem.polyhedra import Faces, Solid, hull
-from dem.shapes import Form
 from dem.vectors import dot
 
 #: Polyhedra touch on faces if the smallest gap there is within this share of the contact distance of their distance; if

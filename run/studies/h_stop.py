@@ -23,7 +23,7 @@ from shared import Table, at_least_one, parser, record, say_machine, spread
 import pctt
 from dem.experiment import option
 from dem.scene import Scene
-from dem.scenes import Incline
+from pctt.scenes import Incline
 
 FLOWS, ABOVE = 2.0, 3.0  # s at the first angle; degrees of it above the law
 SLOW, LASTING = 0.01, 0.5  # of sqrt(g d); s

@@ -16,7 +16,6 @@ import pctt
 from dem.experiment import Experiment, option
 from dem.motion import Fixed, Glide, Guided, Hinged, Oscillation, Rotation
 from dem.scene import Scene
-from dem.scenes import Mixer
 from dem.shapes import Box, Plane
 from dem.together import SceneError
 from pctt.ccp.first_order.apgd import APGD
@@ -24,6 +23,7 @@ from pctt.disk import FileError
 from pctt.options import OptionError
 from pctt.run.options import read_options
 from pctt.run.simulate import simulate
+from pctt.scenes import Mixer
 
 SELF, WORLD, G = MPI.COMM_SELF, MPI.COMM_WORLD, 9.81
 
@@ -243,7 +243,7 @@ def test_the_options_of_petsc_stay_as_they_are(solver, tmp_path):
 
 PLAIN = """
 import sys
-from dem.scenes import Mixer
+from pctt.scenes import Mixer
 from pctt.run import help, simulate
 from pctt.simulation import Simulation
 Simulation(Mixer(n=1), solver="apgd").run(steps=1)

@@ -8,7 +8,7 @@ from dem.arrays import Floats
 from dem.checks import not_negative
 from dem.experiment import option
 from dem.scene import Scene
-from dem.scenes.silo import Silo
+from pctt.scenes.silo import Silo
 
 
 @dataclass(frozen=True)

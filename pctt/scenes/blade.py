@@ -13,9 +13,9 @@ from dem.checks import not_negative, positive
 from dem.experiment import option
 from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import ToAndFro
 from dem.shapes import Box
 from dem.step import Step
+from pctt.scenes.lattice import ToAndFro
 
 
 @dataclass(frozen=True)

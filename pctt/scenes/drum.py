@@ -16,8 +16,8 @@ from dem.mesh import Mesh
 from dem.motion import Rotation
 from dem.packing import uniform
 from dem.scene import Scene
-from dem.scenes.lattice import SmallSpheres, rest_after_fall
 from dem.step import Step
+from pctt.scenes.lattice import SmallSpheres, rest_after_fall
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from dem.experiment import option
 from dem.motion import Hinged, Rotation
 from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import LargeSpheres
 from dem.shapes import Box
+from pctt.scenes.lattice import LargeSpheres
 
 
 @dataclass(frozen=True)

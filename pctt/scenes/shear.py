@@ -15,9 +15,9 @@ from dem.experiment import option
 from dem.motion import Guided
 from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import ToAndFro
 from dem.shapes import Box, Plane, Shape
 from dem.step import Step
+from pctt.scenes.lattice import ToAndFro
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Glide
 from dem.scene import Scene
-from dem.scenes.lattice import SmallSpheres, rest_after_fall
 from dem.shapes import Plane
 from dem.step import Step
+from pctt.scenes.lattice import SmallSpheres, rest_after_fall
 
 
 @dataclass(frozen=True)

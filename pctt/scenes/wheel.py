@@ -17,9 +17,9 @@ from dem.motion import Held
 from dem.packing import perturbed
 from dem.quaternion import exponential
 from dem.scene import Scene
-from dem.scenes.lattice import Spheres, rest_after_fall
 from dem.shapes import Box, Shape
 from dem.step import Step
+from pctt.scenes.lattice import Spheres, rest_after_fall
 
 
 @dataclass(frozen=True)
