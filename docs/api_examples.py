@@ -387,7 +387,7 @@ from dem.shapes import Plane
 class Drop(Experiment):
     """A sphere falls on a floor."""
 
-    height: float = option(1.0, "m", "of the fall")
+    height: float = option(1.0, "of the fall", unit="m")
 
     def build(self) -> Scene:
         scene = Scene(friction=0.5)

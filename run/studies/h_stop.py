@@ -35,7 +35,7 @@ LOW, HIGH, LENGTH = 20.9, 32.8, 1.65  # degrees, degrees, diameters
 class Levelled(Incline):
     """An incline whose angle falls after a while."""
 
-    fall: float = option(0.5, "deg/s", "rate at which the angle falls after two seconds")
+    fall: float = option(0.5, "rate at which the angle falls after two seconds", unit="deg/s")
 
     def angle_at(self, time: float) -> float:
         """[degrees]"""

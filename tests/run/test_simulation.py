@@ -54,7 +54,7 @@ def moved(motion, **more):
 class Stirred(Experiment):
     """Spheres in a box with a plate that a servo turns."""
 
-    speed: float = option(1.0, "rad/s", "of the servo")
+    speed: float = option(1.0, "of the servo", unit="rad/s")
     dt = 0.01
     delta = 0.01
 
