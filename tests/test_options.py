@@ -7,6 +7,8 @@ from typing import Optional
 
 import pytest
 
+from dem.checks import positive
+from dem.experiment import Experiment
 from pctt.ksp_options import refuse_unknown
 from pctt.options import (
     AT_LEAST_ONE,

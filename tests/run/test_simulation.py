@@ -459,7 +459,7 @@ def test_an_error_of_one_rank_is_one_of_all():
             raise KeyError("mine")
         return sim.positions.sum() > 0
 
-    with pytest.raises(SceneError, match="call or stop of run: KeyError: 'mine' .rank 1 of 2."):
+    with pytest.raises(SceneError, match="call or stop of run: KeyError: 'mine' .on rank 1 of 2."):
         sim.run(steps=2, stop=bad)
     with pytest.raises(OptionError, match="tol"):
         pctt.Simulation(Stirred(), tol=2.0 if WORLD.rank else 1e-3)
