@@ -14,12 +14,12 @@ The loop of a simulation, on any number of ranks::
 Import from the modules: `dem.scene`, `dem.shapes`, `dem.motion` describe what there is; `dem.start`, `dem.world`,
 `dem.bodies`, `dem.partition` and `dem.neighbourhood` hold it on the ranks; `dem.unconstrained`, `dem.contact`,
 `dem.system` with `dem.contact_map`, `dem.step` and `dem.impulses` are the time step; `dem.experiment` is what the
-program needs of a scene, and `dem.scenes` has ready-made ones; `dem.record`, `dem.measures` and `dem.analysis` say
-what steps and runs show. All quantities are in SI units.
+program needs of a scene; `dem.record`, `dem.measures` and `dem.analysis` say what steps and runs show. All quantities
+are in SI units.
 """
 
 __all__ = [
     "analysis", "bodies", "checks", "contact", "contact_law", "contact_map", "experiment", "impulses", "joints",
-    "loads", "measures", "mesh", "motion", "neighbourhood", "packing", "partition", "record", "scene", "scenes",
-    "shapes", "sources", "springs", "start", "step", "stiffness", "system", "time_step", "unconstrained", "world",
+    "loads", "measures", "mesh", "motion", "neighbourhood", "packing", "partition", "record", "scene", "shapes",
+    "sources", "springs", "start", "step", "stiffness", "system", "time_step", "unconstrained", "world",
 ]  # fmt: skip

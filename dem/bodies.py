@@ -15,11 +15,12 @@ from dem.compiled import loop
 #: meshes are parts of large bodies only.
 SPHERE, BOX, COMPOUND, CAPSULE, PLANE, MESH = range(6)
 
-#: Clumps of spheres are the kinds from here on: CLUMP + n is the one of number n in `dem.scene.Scene.clumps`.
-CLUMP = 6
+#: Shapes of grains that a scene describes, its forms (`dem.forms.Form`), are the kinds from here on. Their `size` is
+#: alike, so that nothing else needs to know what they are.
+FORM = 6
 
-#: Convex polyhedra are the kinds from here on: POLYHEDRON + n is the one of number n in `dem.scene.Scene.polyhedra`.
-POLYHEDRON = 1 << 20
+#: Of clumps of spheres and of convex polyhedra: CLUMP + n or POLYHEDRON + n has the form n of `dem.scene.Scene.forms`.
+CLUMP, POLYHEDRON = FORM, 1 << 20
 
 
 @dataclass
@@ -36,9 +37,9 @@ class Bodies:
     mass: Floats  #: (n,) [kg]
     inertia: Floats  #: (n, 3) principal moments of inertia in the body frame [kg m^2]
     material: Ints  #: (n,) row of the friction table
-    shape: Ints  #: (n,) SPHERE, BOX, CAPSULE, COMPOUND, or CLUMP or POLYHEDRON and the number of the shape
-    #: (n, 3) sphere: (radius, 0, 0); box: half extents; capsule: (radius, half length, 0); clump and polyhedron: radii
-    #: of the sphere that encloses it, of the ball of its volume, and of its largest sphere [m]
+    shape: Ints  #: (n,) SPHERE, BOX, CAPSULE, COMPOUND, or that of a form
+    #: (n, 3) sphere: (radius, 0, 0); box: half extents; capsule: (radius, half length, 0); form: radii of the sphere
+    #: that encloses it, of the ball of its volume, and of its largest sphere [m]
     size: Floats
     weight: Floats  #: (n,) contacts owned at the last search, the load that balancing spreads
 
@@ -84,7 +85,7 @@ def enclosing_radius(kind: Ints, size: Floats) -> Floats:
     for n in range(len(kind)):
         if kind[n] == CAPSULE:
             out[n] = size[n, 0] + size[n, 1]
-        elif kind[n] >= CLUMP:
+        elif kind[n] >= FORM:
             out[n] = size[n, 0]
         else:
             out[n] = np.sqrt(size[n, 0] ** 2 + size[n, 1] ** 2 + size[n, 2] ** 2)
@@ -94,7 +95,7 @@ def enclosing_radius(kind: Ints, size: Floats) -> Floats:
 def least_half_thickness(bodies: Bodies) -> Floats:
     """Radius (n,) of the greatest sphere that fits into a grain [m]."""
     half = np.where(bodies.shape == BOX, bodies.size.min(axis=1), bodies.size[:, 0])
-    return np.where(bodies.shape >= CLUMP, bodies.size[:, 2], half)
+    return np.where(bodies.shape >= FORM, bodies.size[:, 2], half)
 
 
 def turning(bodies: Bodies) -> Floats:

@@ -10,39 +10,42 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any, ClassVar
 
 import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
+from dem.bodies import CLUMP
 from dem.compiled import loop
+from dem.forms import Form
 from dem.shapes import Clump, principal
 
 CELLS = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class Form:
-    """A clump of density 1 in the frame with its origin at the centre of mass and the principal axes. There is one for
-    each `Clump`."""
+class ClumpForm(Form):
+    """The form of a `Clump`; the volume is that of the union."""
 
     center: Floats  #: (k, 3) of the spheres [m]
     radius: Floats  #: (k,) [m]
-    volume: float  #: of the union [m^3]
-    moments: Floats  #: (3,) principal moments over the density [m^5]
-    place: Floats  #: (3,) the origin in the frame of the `Clump` [m]
-    turn: Floats  #: (4,) the axes in it
+    BASE: ClassVar[int] = CLUMP
+    SCALES: ClassVar[bool] = False
 
     @property
     def size(self) -> Floats:
-        """(3,) radii of the sphere about the origin that encloses the clump, of the ball of its volume, and of its
-        largest sphere, as of `dem.bodies.Bodies` [m]."""
+        """As of `Form`."""
         around = float((np.linalg.norm(self.center, axis=1) + self.radius).max())
         return np.array([around, np.cbrt(0.75 * self.volume / np.pi), self.radius.max()])
 
+    def described(self) -> dict[str, Any]:
+        """As of `Form`: spheres."""
+        return {"centres": self.center.tolist(), "radii": self.radius.tolist()}
+
 
 @cache
-def form(shape: Clump) -> Form:
+def form(shape: Clump) -> ClumpForm:
     """The form of a clump; the same object for equal clumps."""
     center, radius = np.array(shape.centres), np.array(shape.radii)
     middle = center.mean(axis=0)
@@ -50,7 +53,7 @@ def form(shape: Clump) -> Form:
     moments, turn = principal(tensor)
     place = place + middle
     own = quaternion.rotate(quaternion.conjugate(turn), center - place)
-    return Form(own, radius, volume, moments, place, turn)
+    return ClumpForm(volume, moments, place, turn, own, radius)
 
 
 def union(center: Floats, radius: Floats) -> tuple[float, Floats, Floats]:

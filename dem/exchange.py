@@ -109,13 +109,45 @@ def _sums_and_most(here: Any, everywhere: Any, kind: MPI.Datatype) -> None:
 _SUMS_AND_MOST = MPI.Op.Create(_sums_and_most, commute=True)
 
 
+#: The type and the words of an error.
+Failure = tuple[type[Exception], str]
+
+
+def first_of(failures: Sequence[Failure | None]) -> Exception:
+    """The error that all ranks raise, from the failures of each: that of the first that has one, with the ranks that
+    have the same, if not all do."""
+    failed = [rank for rank, failure in enumerate(failures) if failure]
+    kind, text = failures[failed[0]]  # type: ignore[misc]
+    alike = [rank for rank in failed if failures[rank] == failures[failed[0]]]
+    others = [rank for rank in failed if rank not in alike]
+    remark = "" if len(alike) == len(failures) else f" (on {_ranks(alike)} of {len(failures)})"
+    return kind(text + remark + (f"; another failure on {_ranks(others)}" if others else ""))
+
+
+def _ranks(ranks: list[int]) -> str:
+    return f"rank{'s' if len(ranks) > 1 else ''} {', '.join(map(str, ranks))}"
+
+
+def agreed(
+    comm: MPI.Comm, call: Callable[[], Out], own: tuple[type[Exception], ...] = (Exception,),
+    failure: Callable[[Exception], Failure] = lambda error: (type(error), str(error)),
+) -> Out:  # fmt: skip
+    """What `call` returns on this rank. If it raises one of the errors `own` on any rank, all raise what `failure`
+    makes of it. Collective."""
+    found = None
+    try:
+        result = call()
+    except own as error:
+        found = failure(error)
+    if on_any(comm, found is not None)[0]:
+        raise first_of(comm.allgather(found))
+    return result
+
+
 def refuse(comm: MPI.Comm, wrong: str) -> None:
     """ValueError on all ranks if any rank has words for what is wrong with the user's data. Collective."""
-    if not on_any(comm, bool(wrong))[0]:
-        return
-    for rank, words in enumerate(comm.allgather(wrong)):
-        if words:
-            raise ValueError(words + (f" (on rank {rank})" if comm.size > 1 else ""))
+    if on_any(comm, bool(wrong))[0]:
+        raise first_of(comm.allgather((ValueError, wrong) if wrong else None))
 
 
 def on_each(comm: MPI.Comm, what: str, work: Callable[[], Out]) -> Out:

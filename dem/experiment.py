@@ -1,7 +1,7 @@
 """The interface between a scene and the program: options, recommended numerics, bodies, quantities to record.
 
-A scene of one's own is a class derived from `Experiment`; docs/tutorial.md writes one. The scenes of the package,
-`dem.scenes`, are written in the same way and need nothing else.
+A scene of one's own is a class derived from `Experiment`; docs/tutorial.md writes one. The scenes of the package
+(`-scene NAME`) are written in the same way and need nothing else.
 """
 
 from __future__ import annotations
@@ -11,24 +11,19 @@ import hashlib
 import sys
 import traceback
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
 
 from dem import checks
 from dem.arrays import Floats
+from dem.options import option
 from dem.scene import Scene
 from dem.step import Step
 from dem.together import SCENE_FILE, in_words
 
-
-def option(default: Any, unit: str, text: str, test: Callable[[str, Any], Any] | None = None) -> Any:
-    """A field of an experiment: its default, unit ("" if it has none) and meaning, which `-help` shows.
-
-    `test` is a function of `dem.checks`, such as `positive`: it raises ValueError for a name and a bad value.
-    """
-    return dataclasses.field(default=default, metadata={"unit": unit, "help": text, "test": test})
+__all__ = ["Experiment", "Given", "SceneFileError", "from_file", "option"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,13 +47,15 @@ class Experiment:
     digest: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        """ValueError for numbers that fail the test of their option, or are not finite where it has none. The message
+        """ValueError for numbers that fail the check of their option, or are not finite where it has none. The message
         starts with the name of the option. Extend this to check more."""
         for field in dataclasses.fields(self):
-            value, test = getattr(self, field.name), field.metadata.get("test")
-            if test is not None:
-                test(field.name, value)
-            elif isinstance(value, float):
+            value, check = getattr(self, field.name), field.metadata.get("check")
+            if isinstance(check, tuple) and not check[1](value):
+                raise ValueError(f"{field.name} {value}: allowed is {check[0]}")
+            if callable(check):
+                check(field.name, value)
+            elif check is None and isinstance(value, float):
                 checks.finite(field.name, value)
 
     def refuse(self, name: str, why: str) -> None:

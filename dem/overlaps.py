@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dem.arrays import Floats, Ints
-from dem.bodies import BOX, CLUMP, COMPOUND
+from dem.bodies import BOX, COMPOUND, FORM
 from dem.compiled import inlined, loop
 from dem.exchange import reduced
 from dem.step import Step
@@ -51,4 +51,4 @@ def _half(shape, size):
         return np.inf
     if shape == BOX:
         return min(size[0], size[1], size[2])
-    return size[2] if shape >= CLUMP else size[0]
+    return size[2] if shape >= FORM else size[0]

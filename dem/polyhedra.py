@@ -5,14 +5,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from dem import quaternion
 from dem.arrays import ArrayLike, Floats, Ints
+from dem.bodies import POLYHEDRON
 from dem.checks import finite
+from dem.forms import Form
 from dem.shapes import principal
 
 #: Vertices of a polyhedron: contacts are known by pairs of edges, and the search tries all of them.
@@ -33,23 +35,23 @@ class Faces(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Solid:
-    """A convex polyhedron of density 1 in the frame with its origin at the centre of mass and the principal axes. There
-    is one for all grains of the same vertices."""
+class Solid(Form):
+    """The form of a convex polyhedron."""
 
     faces: Faces
-    volume: float  #: [m^3]
-    moments: Floats  #: (3,) principal moments over the density [m^5]
-    place: Floats  #: (3,) the origin in the frame of the vertices that were given [m]
-    turn: Floats  #: (4,) the axes in it
+    BASE: ClassVar[int] = POLYHEDRON
+    SCALES: ClassVar[bool] = True
 
     @property
     def size(self) -> Floats:
-        """(3,) radii of the sphere about the origin that encloses it, of the ball of its volume, and of the largest
-        sphere about the origin in it, as of `dem.bodies.Bodies` [m]."""
+        """As of `Form`; the largest sphere is about the origin."""
         vertex, normal, corner, *_ = self.faces
         depth = np.einsum("fi,fi->f", normal, vertex[corner[:, 0]]).min()
         return np.array([np.linalg.norm(vertex, axis=1).max(), np.cbrt(0.75 * self.volume / np.pi), depth])
+
+    def described(self) -> dict[str, Any]:
+        """As of `Form`: triangles."""
+        return {"vertices": self.faces.vertex.tolist(), "triangles": triangles(self.faces).tolist()}
 
 
 def solid(vertices: ArrayLike) -> Solid:
@@ -70,7 +72,7 @@ def _solid(vertices: tuple[tuple[float, ...], ...]) -> Solid:
     moments, turn = principal(tensor)
     back = quaternion.conjugate(turn)
     own = quaternion.rotate(back, faces.vertex - place), quaternion.rotate(back, faces.normal)
-    return Solid(Faces(*own, *faces[2:]), volume, moments, place + middle, turn)
+    return Solid(volume, moments, place + middle, turn, Faces(*own, *faces[2:]))
 
 
 def hull(vertex: Floats) -> Faces:

@@ -22,17 +22,15 @@ from mpi4py import MPI
 
 from dem import bodies, checks, clumps, contact_law, polyhedra, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints, Rule
-from dem.bodies import BOX, CAPSULE, CLUMP, COMPOUND, MESH, PLANE, POLYHEDRON, SPHERE, Bodies
-from dem.clumps import Form
+from dem.bodies import BOX, CAPSULE, COMPOUND, MESH, PLANE, SPHERE, Bodies
 from dem.contact_law import ContactLaw
+from dem.forms import Form
 from dem.joints import Joint, whole_periods
 from dem.loads import Law, Load, On
 from dem.measures import Block, Cylinder
-from dem.mesh import Mesh
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
-from dem.polyhedra import Solid
 from dem.quaternion import across, length
-from dem.shapes import Box, Capsule, Clump, Shape
+from dem.shapes import Clump, Shape
 from dem.sources import MOST_IDS, Outlet, Source
 from dem.springs import End, Spring
 from dem.survey import Survey, survey
@@ -177,8 +175,7 @@ class Scene:
         self._materials: dict[str, int] = {}
         self.parts: list[Part] = []  #: the grains, as they were added
         self._survey: Survey | None = None
-        self.clumps: list[Form] = []  #: the distinct shapes of clumps; their kinds are CLUMP and the number
-        self.polyhedra: list[Solid] = []  #: the same of polyhedra, and POLYHEDRON
+        self.forms: list[Form] = []  #: the distinct shapes of clumps and polyhedra, see `dem.bodies`
         self.loads: dict[str, Load] = {}  #: by name
         self.springs: dict[str, Spring] = {}  #: by name
         self.sources: dict[str, Source] = {}  #: by name
@@ -265,20 +262,7 @@ class Scene:
         for all or (n,); velocities (3,) or (n, 3), the linear one is that of the centre of mass.
         """
         form = clumps.form(shape)
-        if form not in self.clumps:
-            self.clumps.append(form)
-        place, turn, size = form.place, form.turn, form.size
-
-        def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
-            turns, rho, many = _unit(given["quaternions"]), given["density"], len(given["density"])
-            centers = given["positions"] + quaternion.rotate(turns, place)
-            turns = quaternion.multiply(turns, np.tile(turn, (many, 1)))
-            return centers, turns, np.tile(size, (many, 1)), rho * form.volume, rho[:, None] * form.moments
-
-        kind = CLUMP + self.clumps.index(form)
-        return self._append(
-            kind, positions, {}, density, material, quaternions, velocity, angular_velocity, solid
-        )
+        return self._add_form(form, positions, density, 1.0, quaternions, material, velocity, angular_velocity)
 
     def add_polyhedra(
         self,
@@ -301,20 +285,7 @@ class Scene:
         of mass. ValueError for vertices that are not the corners of a convex solid.
         """
         form = polyhedra.solid(vertices)
-        if form not in self.polyhedra:
-            self.polyhedra.append(form)
-
-        def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
-            turns, rho, times = _unit(given["quaternions"]), given["density"][:, None], given["scale"][:, None]
-            centers = given["positions"] + quaternion.rotate(turns, times * form.place)
-            turns = quaternion.multiply(turns, np.tile(form.turn, (len(rho), 1)))
-            mass, inertia = (rho * times**3 * form.volume)[:, 0], rho * times**5 * form.moments
-            return centers, turns, times * form.size, mass, inertia
-
-        kind = POLYHEDRON + self.polyhedra.index(form)
-        return self._append(
-            kind, positions, {"scale": scale}, density, material, quaternions, velocity, angular_velocity, solid
-        )
+        return self._add_form(form, positions, density, scale, quaternions, material, velocity, angular_velocity)
 
     def add_body(
         self,
@@ -493,6 +464,12 @@ class Scene:
         return MOST_IDS if self.sources else self.count
 
     @property
+    def kinds(self) -> list[int]:
+        """The kinds of grains that there are, or that sources may add, as of `dem.bodies`."""
+        later = (source.extremes().shape.tolist() for source in self.sources.values())
+        return sorted({part.kind for part in self.parts}.union(*later))
+
+    @property
     def count(self) -> int:
         """Number of the grains at time zero."""
         return sum(part.count for part in self.parts)
@@ -555,14 +532,10 @@ class Scene:
 
     def grains(self, first: int = 0, end: int | None = None) -> Bodies:
         """The grains from the id `first` on and before `end`, all by default. ValueError if there is nothing that
-        moves, or if shapes might meet that cannot touch: meshes and boxes, polyhedra or other meshes; capsules and
-        polyhedra."""
+        moves."""
         later = [source.extremes() for source in self.sources.values()]
         if self.count + len(later) + len(self._free()) == 0:
             raise ValueError("empty scene: there is no grain, and no large body that forces move")
-        of_grains = {part.kind for part in self.parts}.union(*(table.shape.tolist() for table in later))
-        _refuse_beside_meshes(self.large_bodies, of_grains)
-        _refuse_capsules(self.large_bodies, of_grains)
         if self.period is not None:
             tables = [self.survey().extremes, *later]
             _refuse_in_cell(self, self.period, max(float(bodies.bounding_radius(t).max(initial=0.0)) for t in tables))
@@ -611,6 +584,27 @@ class Scene:
 
         return self._append(
             kind, positions, lengths, density, material, quaternions, velocity, angular_velocity, solid
+        )
+
+    def _add_form(
+        self, form: Form, positions: ArrayLike, density: ArrayLike, scale: ArrayLike, quaternions: ArrayLike,
+        material: str, velocity: ArrayLike, angular_velocity: ArrayLike,
+    ) -> Ints | range:  # fmt: skip
+        """Add grains of one form, whose positions and quaternions are those of the frame in which it was given; their
+        ids."""
+        if form not in self.forms:
+            self.forms.append(form)
+
+        def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
+            turns, rho, times = _unit(given["quaternions"]), given["density"][:, None], given["scale"][:, None]
+            centers = given["positions"] + quaternion.rotate(turns, times * form.place)
+            turns = quaternion.multiply(turns, np.tile(form.turn, (len(rho), 1)))
+            mass, inertia = (rho * times**3 * form.volume)[:, 0], rho * times**5 * form.moments
+            return centers, turns, times * form.size, mass, inertia
+
+        kind = form.BASE + self.forms.index(form)
+        return self._append(
+            kind, positions, {"scale": scale}, density, material, quaternions, velocity, angular_velocity, solid
         )
 
     def _append(
@@ -695,34 +689,6 @@ def _turning(body: LargeBody, motion: Dynamic) -> LargeBody:
     upright = quaternion.from_matrix(np.stack([x, np.cross(axis, x), axis], axis=1))
     turned = _reframed(body, np.zeros(3), quaternion.multiply(back, upright))
     return replace(turned, quaternion=upright, inertia=np.array([np.inf, np.inf, moment]))
-
-
-def _refuse_capsules(members: Sequence[LargeBody], of_grains: set[int]) -> None:
-    """ValueError for capsules that might meet polyhedra, if there are such among the kinds of grains."""
-    if max(of_grains, default=0) >= POLYHEDRON:
-        of_bodies = [body.name for body in members if any(isinstance(shape, Capsule) for shape in body.shapes)]
-        if CAPSULE in of_grains or of_bodies:
-            what = f"the capsule of {of_bodies[0]!r}" if of_bodies else "grains that are capsules"
-            raise ValueError(f"polyhedra cannot touch {what}: take spheres, boxes, planes or clumps of spheres")
-
-
-def _refuse_beside_meshes(members: Sequence[LargeBody], of_grains: set[int]) -> None:
-    """ValueError for pairs of a mesh and a box or another mesh that might meet, and for grains that are boxes or
-    polyhedra, by their kinds: they have no contacts."""
-    for body in members:
-        if not any(isinstance(shape, Mesh) for shape in body.shapes):
-            continue
-        if BOX in of_grains or max(of_grains, default=0) >= POLYHEDRON:
-            what = "boxes" if BOX in of_grains else "polyhedra"
-            raise ValueError(f"grains that are {what} cannot touch the mesh of {body.name!r}: take spheres or capsules")
-        for other in members:
-            moves = isinstance(body.motion, Dynamic) or isinstance(other.motion, Dynamic)
-            kinds = [type(shape).__name__ for shape in other.shapes if isinstance(shape, (Box, Mesh))]
-            if other is not body and moves and kinds:
-                raise ValueError(
-                    f"the {kinds[0].lower()} of {other.name!r} cannot touch the mesh of {body.name!r}, of which one is "
-                    "dynamic: make the other of planes, spheres or capsules"
-                )
 
 
 def least_half(body: LargeBody) -> float:

@@ -13,12 +13,12 @@ from dem import bodies, stiffness
 from dem.arrays import Ints
 from dem.bodies import Bodies
 from dem.changes import refuse_load
-from dem.clumps import Form
 from dem.contact import find_contacts
+from dem.contact.primitives import refuse_untouchable
 from dem.exchange import exchange, refuse
+from dem.forms import Form
 from dem.partition import redistribute
 from dem.period import put_back, velocity_in_cell, wrapped
-from dem.polyhedra import Solid
 from dem.scene import Scene, least_half
 from dem.sources import Tally, from_array
 from dem.world import Servo, Shear, World
@@ -88,9 +88,8 @@ def _refuse_impossible(world: World) -> None:
     for table, what in ((world.grains, "grain"), (world.large, "large body")):
         grains = what == "grain"
         heavy = np.concatenate([table.mass, table.inertia.ravel()])
-        clumps = range(bodies.CLUMP, bodies.CLUMP + len(world.clumps))
-        polyhedra = range(bodies.POLYHEDRON, bodies.POLYHEDRON + len(world.polyhedra))
-        of_grains = (bodies.SPHERE, bodies.BOX, bodies.CAPSULE, *clumps, *polyhedra)
+        of_forms = (form.BASE + n for n, form in enumerate(world.forms))
+        of_grains = (bodies.SPHERE, bodies.BOX, bodies.CAPSULE, *of_forms)
         kinds = np.isin(table.shape, of_grains if grains else (bodies.COMPOUND,))
         right = {
             "position": np.isfinite(table.position),
@@ -100,8 +99,7 @@ def _refuse_impossible(world: World) -> None:
             "material": (table.material >= 0) & (table.material < len(world.materials)),
             "shape": kinds,
             "size": np.isfinite(table.size) & (table.size >= 0.0) & (table.size[:, :1] > 0.0 if grains else True),
-            "clump": np.array([_is_of(table, n, form) for n, form in enumerate(world.clumps)]),
-            "polyhedron": np.array([_is_scaled(table, n, form) for n, form in enumerate(world.polyhedra)]),
+            "form": np.array([_is_of(table, n, form) for n, form in enumerate(world.forms)]),
         }
         wrong += [f"{name} of a {what}" for name, good in right.items() if not good.all()]
     starts = np.arange(world.comm.size + 1) * world.ids // world.comm.size
@@ -115,15 +113,9 @@ def _refuse_impossible(world: World) -> None:
 
 
 def _is_of(table: Bodies, number: int, form: Form) -> bool:
-    """Whether the clumps of this number in a table have the sizes of the form."""
-    size = table.size[table.shape == bodies.CLUMP + number]
-    return bool(np.allclose(size, form.size, rtol=1e-9, atol=0.0))
-
-
-def _is_scaled(table: Bodies, number: int, form: Solid) -> bool:
-    """Whether the polyhedra of this number in a table have the sizes of the form, up to a scale."""
-    size = table.size[table.shape == bodies.POLYHEDRON + number] / form.size
-    return bool(np.allclose(size, size[:, :1], rtol=1e-9, atol=0.0))
+    """Whether the grains of this form in a table have its sizes, times a scale if they have one."""
+    size = table.size[table.shape == form.BASE + number] / form.size
+    return bool(np.allclose(size, size[:, :1] if form.SCALES else 1.0, rtol=1e-9, atol=0.0))
 
 
 def restart_rows(slabs: Ints, comm: MPI.Comm) -> slice:
@@ -164,7 +156,8 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
     world.loads, world.springs, world.period = dict(scene.loads), dict(scene.springs), scene.period
-    world.clumps, world.polyhedra = tuple(scene.clumps), tuple(scene.polyhedra)
+    world.forms = tuple(scene.forms)
+    refuse_untouchable(scene.kinds, scene.large_bodies)
     world.sources, world.outlets = dict(scene.sources), dict(scene.outlets)
     world.tallies = {name: Tally() for name in (*world.sources, *world.outlets)}
     world.initial, world.first_large = scene.count, scene.first_large

@@ -17,7 +17,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Floats
-from dem.exchange import reduced
+from dem.exchange import first_of, reduced
 
 Result = TypeVar("Result")
 
@@ -60,13 +60,8 @@ def meet(
     if not wrong and most == -least:
         return total
     places, failures = zip(*comm.allgather((where, failure)))
-    failed = [rank for rank in range(comm.size) if failures[rank]]
-    if failed:
-        kind, text = failures[failed[0]]
-        alike = [rank for rank in failed if failures[rank] == failures[failed[0]]]
-        remark = "" if len(alike) == comm.size else f" ({_ranks(alike)} of {comm.size})"
-        others = [rank for rank in failed if rank not in alike]
-        raise kind(text + remark + (f"; another failure on {_ranks(others)}" if others else ""))
+    if any(failures):
+        raise first_of(failures)
     listed = ", ".join(f"rank {rank} at {place}" for rank, place in enumerate(places))
     raise SceneError(f"the code of a scene must make the same calls on all ranks, but {listed}")
 
@@ -113,10 +108,6 @@ def _place(error: BaseException) -> str:
     frames = [
         (frame.f_code.co_filename, line)
         for frame, line in traceback.walk_tb(error.__traceback__)
-        if frame.f_globals.get("__name__", "").startswith((SCENE_FILE, "dem.scenes."))
+        if (name := frame.f_globals.get("__name__", "")).startswith(SCENE_FILE) or ".scenes." in name
     ]
     return f"{frames[-1][0]}, line {frames[-1][1]}: " if frames else ""
-
-
-def _ranks(ranks: list[int]) -> str:
-    return f"rank{'s' if len(ranks) > 1 else ''} {', '.join(map(str, ranks))}"

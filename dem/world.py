@@ -12,12 +12,11 @@ from mpi4py import MPI
 from dem import bodies
 from dem.arrays import Floats, Ints, Keys
 from dem.bodies import Bodies
-from dem.clumps import Form
 from dem.contact_law import ContactLaw
+from dem.forms import Form
 from dem.joints import Joint
 from dem.loads import Load
 from dem.motion import Dynamic, Pose, checked_pose
-from dem.polyhedra import Solid
 from dem.scene import LargeBody
 from dem.sources import Outlet, Source, Tally, as_array
 from dem.springs import Spring
@@ -84,8 +83,7 @@ class World:
     sources: dict[str, Source] = field(default_factory=dict)  #: by name
     outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
     tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets, by name
-    clumps: tuple[Form, ...] = ()  #: shapes of grains, by their numbers
-    polyhedra: tuple[Solid, ...] = ()  #: shapes of grains, by their numbers
+    forms: tuple[Form, ...] = ()  #: shapes of grains, by their numbers
     initial: int = 0  #: number of grains at time zero
     first_large: int = 0  #: id of the first large body
     shear: Shear | None = None  #: of the cell

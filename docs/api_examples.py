@@ -15,7 +15,7 @@ print("floor bears", -sim.body("floor").force[2], "N of", 9.81 * sim.local.mass.
 
 # %% pctt.Settings
 import pctt
-from dem.scenes import Mixer
+from pctt.scenes import Mixer
 
 settings = pctt.Settings(solver="apgd", tol=1e-3, dt=0.01)
 for n in (1, 2):
@@ -42,8 +42,8 @@ print("and back to", abs(round(fan.velocity[5], 9)))
 
 # %% pctt.folder.Folder, pctt.folder.Frame, pctt.folder.Table, pctt.folder.Contacts
 import pctt
-from dem.scenes import Mixer
 from pctt.folder import Folder
+from pctt.scenes import Mixer
 
 with pctt.Simulation(Mixer(n=1), solver="apgd", dt=0.01, say=lambda text: None) as sim:
     sim.write("results", every=5)
@@ -58,9 +58,9 @@ print("columns", [name for name in folder.records() if "energy" in name][:3])
 
 # %% pctt.folder.Snapshot
 import pctt
-from dem.scenes import Belt
 from pctt.folder import Snapshot
 from pctt.render import Picture
+from pctt.scenes import Belt
 
 print("what", Picture.__name__, "draws of a simulation:", Snapshot.__doc__.splitlines()[0])
 print("sim.render() makes one of", len(pctt.Simulation(Belt(n=1)).ids), "grains")
@@ -387,7 +387,7 @@ from dem.shapes import Plane
 class Drop(Experiment):
     """A sphere falls on a floor."""
 
-    height: float = option(1.0, "m", "of the fall")
+    height: float = option(1.0, "of the fall", unit="m")
 
     def build(self) -> Scene:
         scene = Scene(friction=0.5)
@@ -421,8 +421,8 @@ try:
 except SceneFileError as error:
     print(error)
 
-# %% dem.scenes.*
-from dem.scenes import SCENES
+# %% pctt.scenes.*
+from pctt.scenes import SCENES
 
 for name, scene in SCENES.items():
     built = scene().build()
@@ -431,8 +431,8 @@ for name, scene in SCENES.items():
 # %% dem.world.World
 from mpi4py import MPI
 
-from dem.scenes import Mixer
 from dem.start import new_world
+from pctt.scenes import Mixer
 
 world = new_world(Mixer(n=1).build(), MPI.COMM_SELF)
 print(len(world.grains), "grains on this rank,", world.body_count, "bodies in all; time", world.time, "s")
@@ -451,7 +451,7 @@ print("rate", shear.rate, "1/s: the images above are", round(shear.shift, 3), "m
 
 # %% dem.world.Servo
 import pctt
-from dem.scenes import PlaneShear
+from pctt.scenes import PlaneShear
 
 sim = pctt.Simulation(PlaneShear(n=6))
 print("stress that the cell is to have along x, y, z:", sim.world.servo.asked, "Pa")
@@ -459,7 +459,7 @@ print("stress that the cell is to have along x, y, z:", sim.world.servo.asked, "
 # %% dem.bodies.Bodies
 import pctt
 from dem.bodies import is_dynamic
-from dem.scenes import Mixer
+from pctt.scenes import Mixer
 
 table = pctt.Simulation(Mixer(n=1)).local  # one row for each grain of this rank
 print(len(table), "rows,", int(is_dynamic(table).sum()), "of them moved by forces")
@@ -501,10 +501,10 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.contact import find_contacts
-from dem.scenes import Belt
 from dem.start import new_world
 from dem.system import ContactSystem
 from dem.unconstrained import unconstrained
+from pctt.scenes import Belt
 
 world = new_world(Belt(n=2).build(), MPI.COMM_SELF)
 free = unconstrained(world, 0.001)
@@ -739,8 +739,8 @@ print("ranks", compression.train.ranks, "error", f"{compression.error:.0e}")
 
 # %% pctt.options.OptionError
 import pctt
-from dem.scenes import Mixer
 from pctt.options import OptionError
+from pctt.scenes import Mixer
 
 try:
     pctt.Simulation(Mixer(n=1), solver="apgf")

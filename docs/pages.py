@@ -18,11 +18,11 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
-from dem.scenes import SCENES
 from pctt import ccp
 from pctt.options import Description, describe
 from pctt.pc import BlockICC, TensorTrain
 from pctt.run.settings import Run, Settings
+from pctt.scenes import SCENES
 
 DOCS = Path(__file__).resolve().parent
 EXAMPLES = DOCS / "examples"
@@ -33,7 +33,7 @@ PARTS = {
     "Simulations and their results": ["pctt", "pctt.simulation", "pctt.folder", "pctt.analysis", "dem.measures"],
     "What a scene is made of": [
         "dem.scene", "dem.shapes", "dem.mesh", "dem.motion", "dem.contact_law", "dem.loads", "dem.springs",
-        "dem.joints", "dem.sources", "dem.packing", "dem.experiment", "dem.scenes", "dem.stiffness", "dem.time_step",
+        "dem.joints", "dem.sources", "dem.packing", "dem.experiment", "pctt.scenes", "dem.stiffness", "dem.time_step",
         "dem.checks", "dem.analysis",
     ],
     "What a time step is made of": [

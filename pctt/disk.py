@@ -407,12 +407,7 @@ def same_rows(file: h5py.Group, names: Iterable[str], count: int | None = None) 
 
 def _together(what: str, comm: MPI.Comm, call: Callable[[], Found]) -> Found:
     """What the call returns on this rank; FileError on all ranks if it fails on one: ``what``, and why; collective."""
-    failure = None
-    try:
-        found = call()
-    except (KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
-        failure = getattr(error, "strerror", None) or str(error)
-    if exchange.on_any(comm, failure is not None)[0]:
-        failures = [text for text in comm.allgather(failure) if text is not None]
-        raise FileError(f"{what} ({failures[0]})")
-    return found
+    own = (KeyError, OSError, RuntimeError, TypeError, ValueError)
+    return exchange.agreed(
+        comm, call, own, lambda error: (FileError, f"{what} ({getattr(error, 'strerror', None) or error})")
+    )

@@ -21,7 +21,6 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from dem.bodies import CLUMP, POLYHEDRON
 from pctt.disk import FileError, hdf5, refuse_links, whole, write_text
 from pctt.folder import RUN_FILES, Folder, Frame
 from pctt.look.program import chosen, made_folder, parser, run, told_steps
@@ -53,7 +52,7 @@ def main(comm: MPI.Comm) -> None:
     from pctt.look.surfaces import Scene  # imported here, because it needs vtk and -help does not
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # the writers' results are checked
-    names = [*SERIES, *(["polyhedra"] if folder.polyhedra else [])]
+    names = [*SERIES, *(["polyhedra"] if any("triangles" in form for form in folder.forms) else [])]
     scene = Scene(folder, [folder.frame(step) for step in (steps[0], steps[-1])])
     if given.format == "vtp":
         times = {}
@@ -102,7 +101,7 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
 def series(name: str, scene: Any, frame: Frame) -> Any:
     """One step of the series ``name``, one of SERIES or polyhedra, as vtkPolyData; ``scene`` is a
     `pctt.look.surfaces.Scene`."""
-    return {"bodies": bodies, "contacts": contacts, "large": large, "polyhedra": polyhedra}[name](scene, frame)
+    return {"bodies": bodies, "contacts": contacts, "large": large, "polyhedra": facets}[name](scene, frame)
 
 
 def bodies(scene: Any, frame: Frame) -> Any:
@@ -115,11 +114,10 @@ def bodies(scene: Any, frame: Frame) -> Any:
     """
     from pctt.look import surfaces
 
-    table, grains = frame.table, slice(frame.table.grains)
-    clump, place, radius = surfaces.members(frame)
-    shape = table.shape[grains]
-    whole = np.flatnonzero((shape < CLUMP) | (shape >= POLYHEDRON))
-    rows = np.concatenate([whole, clump])
+    table = frame.table
+    of_form, place, radius = surfaces.members(frame)
+    whole = np.setdiff1d(np.arange(table.grains), of_form)
+    rows = np.concatenate([whole, of_form])
     data = surfaces.polydata(np.concatenate([frame.position[whole], place]), "verts", 1)
     extent = surfaces.extent(scene.folder.path, table)[rows]
     extent[len(whole) :] = 2.0 * radius[:, None]
@@ -128,7 +126,7 @@ def bodies(scene: Any, frame: Frame) -> Any:
     return data
 
 
-def polyhedra(scene: Any, frame: Frame) -> Any:
+def facets(scene: Any, frame: Frame) -> Any:
     """The surfaces of the grains that are polyhedra, with the data of the grain for each triangle."""
     from pctt.look import surfaces
 

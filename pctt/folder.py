@@ -189,8 +189,7 @@ class Table:
     mass: np.ndarray  #: (n,) [kg]
     material: np.ndarray  #: (n,)
     grains: int  #: the first rows
-    clumps: Sequence[dict[str, Any]] = ()  #: centres (k, 3) and radii (k,) of the spheres of each clump [m]
-    polyhedra: Sequence[dict[str, Any]] = ()  #: vertices (v, 3) [m] and triangles (t, 3) of each
+    forms: Sequence[dict[str, Any]] = ()  #: kinds, and surfaces as of `dem.forms.Form.described`
 
     @property
     def radius(self) -> np.ndarray:
@@ -241,16 +240,15 @@ class Folder:
 
         def take(file: h5py.File) -> list[Any]:
             same_rows(file, TABLE[1:])
-            forms = [file[name][()] if name in file else "[]" for name in ("clumps", "polyhedra")]
-            return [*(file[name][()] for name in (*TABLE[1:], "materials", "large")), *forms]
+            forms = file["forms"][()] if "forms" in file else "[]"
+            return [*(file[name][()] for name in (*TABLE[1:], "materials", "large")), forms]
 
         found = disk.read(self.bodies_path, MPI.COMM_SELF, take, sealed=False)
         self.shape, self.size, self.mass, self.material = found[:4]
         #: names of the materials by their numbers; name and shapes of each large body, the rows after the grains
         self.materials: list[str] = [name.decode() for name in found[4]]
         self.large: list[dict[str, Any]] = json.loads(found[5])
-        self.clumps: list[dict[str, Any]] = json.loads(found[6])
-        self.polyhedra: list[dict[str, Any]] = json.loads(found[7])
+        self.forms: list[dict[str, Any]] = json.loads(found[6])
         self.grains = len(self.shape) - len(self.large)
 
     @property
@@ -258,7 +256,7 @@ class Folder:
         """What the bodies are; in scenes with sources or outlets those of the first frame, and each frame has its
         own."""
         columns = np.arange(len(self.shape)), self.shape, self.size, self.mass, self.material
-        return Table(*columns, self.grains, self.clumps, self.polyhedra)
+        return Table(*columns, self.grains, self.forms)
 
     @property
     def radius(self) -> np.ndarray:
@@ -280,7 +278,7 @@ class Folder:
             if "id" in file:  # of a scene with sources or outlets
                 own = {name: file[name][()] for name in TABLE}
                 count = len(own["id"]) - len(self.large)
-                table = Table(**own, grains=count, clumps=self.clumps, polyhedra=self.polyhedra)
+                table = Table(**own, grains=count, forms=self.forms)
                 rows[0] = np.searchsorted(table.id, rows[0])
             else:
                 table = self.table
@@ -396,8 +394,7 @@ class Snapshot(Folder):
         self.path, self.steps, self._present = Path(), [frame.step], frame
         self.shape, self.size, self.mass = frame.table.shape, frame.table.size, frame.table.mass
         self.material, self.materials, self.large = frame.table.material, [*materials], large
-        self.grains, self.clumps = frame.table.grains, [*frame.table.clumps]
-        self.polyhedra = [*frame.table.polyhedra]
+        self.grains, self.forms = frame.table.grains, [*frame.table.forms]
 
     def frame(self, step: int) -> Frame:
         return self._present

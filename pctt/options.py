@@ -11,31 +11,17 @@ import math
 import numbers
 import sys
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 from dem.checks import nearest
+from dem.options import option as option
 
 Group = TypeVar("Group")
 
 
 class OptionError(ValueError):
     """A bad option. The message names the option, its value and the allowed values."""
-
-
-def option(
-    default: Any,
-    help: str,
-    *,
-    unit: str = "",
-    choices: Iterable[str] = (),
-    check: tuple[str, Callable[[Any], bool]] | None = None,
-    name: str = "",
-) -> Any:
-    """A dataclass field that is an option. ``check`` is a pair: the allowed values in words, and a test of a value.
-    ``name`` is that of the option, if it is not the prefix of the group and the name of the field."""
-    metadata = {"help": help, "unit": unit, "choices": tuple(choices), "check": check, "name": name}
-    return dataclasses.field(default=default, metadata=metadata)
 
 
 def number(default: Any, why: str) -> Any:
@@ -133,7 +119,7 @@ def _kind(hint: Any) -> Any:
 def _allowed(kind: Any, metadata: Mapping[str, Any]) -> str:
     check, choices = metadata.get("check"), metadata.get("choices")
     kinds = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
-    return f"one of {', '.join(choices)}" if choices else check[0] if check else kinds[kind]
+    return f"one of {', '.join(choices)}" if choices else check[0] if isinstance(check, tuple) else kinds[kind]
 
 
 def _refuse(given: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> None:
@@ -141,8 +127,9 @@ def _refuse(given: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> N
     choices, check = metadata.get("choices"), metadata.get("check")
     if choices and value not in choices:
         raise OptionError(f"{given}: allowed is {_allowed(kind, metadata)}{nearest(value, choices)}")
-    most = math.inf if metadata.get("test") else sys.float_info.max  # the test of a scene may allow inf
-    allowed, test = check or ("a finite number", lambda x: kind is not float or -most <= x <= most)
+    if callable(check):  # the scene itself calls it
+        return
+    allowed, test = check or ("a finite number", lambda x: kind is not float or abs(x) <= sys.float_info.max)
     if not test(value):
         raise OptionError(f"{given}: allowed is {allowed}")
 

@@ -484,8 +484,7 @@ class Simulation:
         velocity[:grains] = velocity_in_cell(position[:grains], velocity[:grains], world.shear)
         position[:grains] = wrapped(position[:grains], world.period, world.shear)
         contacts = self.contacts if self.last else Contacts.none()
-        forms = described_forms(world)
-        what = Table(**table, grains=grains, clumps=forms["clumps"], polyhedra=forms["polyhedra"])
+        what = Table(**table, grains=grains, forms=described_forms(world))
         frame = Frame(self.steps, self.time, position, turn, velocity, contacts, what)
         return Snapshot(frame, materials=world.materials, large=described_bodies(world))
 

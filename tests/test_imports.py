@@ -61,6 +61,7 @@ BELOW = {
         "pctt.tt",
     },
     "pctt.folder": {"dem", "pctt.disk"},
+    "pctt.scenes": {"dem"},
     "pctt.analysis": {"dem", "pctt.disk", "pctt.folder"},
     "pctt.look": {"dem", "pctt.disk", "pctt.folder", "pctt.options", "pctt.petsc"},
 }

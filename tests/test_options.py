@@ -7,6 +7,8 @@ from typing import Optional
 
 import pytest
 
+from dem.checks import positive
+from dem.experiment import Experiment
 from pctt.ksp_options import refuse_unknown
 from pctt.options import (
     AT_LEAST_ONE,
@@ -150,3 +152,19 @@ def test_described_defaults_pass_their_own_checks():
     for (group, prefix), lines in zip(groups, described):
         given = {line.name: str(line.default) for line in lines if line.default not in (None, "")}
         assert read(group, given, prefix) == group()
+
+
+@dataclasses.dataclass(frozen=True)
+class Checked(Experiment):
+    pair: float = option(1.0, "as options of programs have it", check=POSITIVE)
+    function: float = option(1.0, "of dem.checks", check=positive)
+
+
+def test_a_scene_takes_both_kinds_of_checks():
+    assert read(Checked, {"pair": "2"}).pair == 2.0
+    with pytest.raises(OptionError, match="-pair -1: allowed is a positive number"):
+        read(Checked, {"pair": "-1"})
+    with pytest.raises(ValueError, match="pair -1.0: allowed is a positive number"):
+        Checked(pair=-1.0)
+    with pytest.raises(ValueError, match="function must be positive, got -1"):
+        Checked(function=-1.0)

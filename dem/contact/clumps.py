@@ -10,8 +10,9 @@ import numpy as np
 from dem import quaternion
 from dem.arrays import Floats, Ints
 from dem.bodies import CLUMP, PLANE, POLYHEDRON, Bodies
-from dem.clumps import Form
+from dem.clumps import ClumpForm
 from dem.compiled import inlined, loop
+from dem.forms import Form
 
 
 class Members(NamedTuple):
@@ -28,16 +29,27 @@ class Members(NamedTuple):
         return position[self.row] + quaternion.rotate(turn[self.row], self.center)
 
 
+def spheres(forms: Sequence[Form]) -> tuple[list[Floats], list[Floats]]:
+    """Centres (k, 3) and radii (k,) of the spheres of each of some forms; those that are no clumps have none [m]."""
+    none = np.zeros((0, 3)), np.zeros(0)
+    each = [(form.center, form.radius) if isinstance(form, ClumpForm) else none for form in forms]
+    return [center for center, _ in each], [radius for _, radius in each]
+
+
 def more_numbers(forms: Sequence[Form], grains: int) -> int:
     """How many numbers the spheres of so many grains take beyond those that have the ids of their clumps."""
-    return grains * (max((len(form.radius) for form in forms), default=1) - 1)
+    return grains * (max([1, *map(len, spheres(forms)[1])]) - 1)
 
 
-def members(table: Bodies, forms: Sequence[Form], first: int) -> Members:
-    """The spheres of all clumps of a table of grains; the numbers beyond the ids go from `first` on."""
+def members(table: Bodies, forms: Sequence[Form], first: int) -> Members | None:
+    """The spheres of all clumps of a table of grains; the numbers beyond the ids go from `first` on. None in scenes
+    without."""
+    centers, radii = spheres(forms)
+    if not any(map(len, radii)):
+        return None
     clump = np.flatnonzero((table.shape >= CLUMP) & (table.shape < POLYHEDRON))
     which = table.shape[clump] - CLUMP
-    many = np.array([len(form.radius) for form in forms])
+    many = np.array([len(radius) for radius in radii])
     count = np.zeros(len(table), np.int64)
     count[clump] = many[which]
     start = np.concatenate([[0], np.cumsum(count)])
@@ -45,8 +57,7 @@ def members(table: Bodies, forms: Sequence[Form], first: int) -> Members:
     k = np.arange(len(row)) - start[row]
     of_form = np.repeat((np.cumsum(many) - many)[which], many[which]) + k
     number = np.where(k == 0, table.id[row], first + table.id[row] * (many.max() - 1) + k - 1)
-    center = np.concatenate([form.center for form in forms])[of_form]
-    return Members(start, row, number, center, np.concatenate([form.radius for form in forms])[of_form])
+    return Members(start, row, number, np.concatenate(centers)[of_form], np.concatenate(radii)[of_form])
 
 
 @loop

@@ -81,7 +81,7 @@ def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
     wide = near if periodic is None else periodic.among(near)
     seen = wide.grains + wide.ghosts
     large = [body.shapes for body in world.large_bodies]
-    table = primitives(wide, large, world.first_large, world.clumps, world.initial, world.polyhedra)
+    table = primitives(wide, large, world.first_large, world.forms, world.initial)
     pairs = close_pairs(table.center[:seen], table.radius[:seen] + wide.margin)
     if periodic is not None:
         pairs = between(pairs, wide)

@@ -23,6 +23,7 @@ import numpy as np
 from dem.arrays import Floats, Ints
 from dem.compiled import loop
 from dem.contact.narrow import CORNERS, Manifold, Planes, Spheres, Touch
+from dem.forms import Form
 from dem.polyhedra import Faces, Solid, hull
 from dem.vectors import dot
 
@@ -70,9 +71,10 @@ class Hulls(NamedTuple):
 
 
 @cache
-def hulls_of(solids: tuple[Solid, ...]) -> Hulls:
-    """The box of half extents one, which is number 0, and these."""
-    each = [hull(CORNERS), *(solid.faces for solid in solids)]
+def hulls_of(forms: tuple[Form, ...]) -> Hulls:
+    """The box of half extents one, which is number 0, and these; of forms that are no polyhedra that box again."""
+    box = hull(CORNERS)
+    each = [box, *(form.faces if isinstance(form, Solid) else box for form in forms)]
     counts = np.array([(len(own.vertex), len(own.normal), len(own.edge)) for own in each])
 
     def padded(columns: Sequence[np.ndarray]) -> np.ndarray:

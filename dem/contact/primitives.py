@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import combinations, combinations_with_replacement, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,6 @@ import numpy as np
 from dem import quaternion
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, CLUMP, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
-from dem.clumps import Form
 from dem.contact.ahead import Course, hosts_first, seen_from, turn_ahead
 from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
@@ -37,9 +37,11 @@ from dem.contact.polyhedra import (
     spheres_polyhedra,
 )
 from dem.contact.spheres import touch_spheres
+from dem.forms import Form
 from dem.mesh import Mesh, Surface
+from dem.motion import Dynamic
 from dem.neighbourhood import Neighbourhood
-from dem.polyhedra import Solid
+from dem.scene import LargeBody
 from dem.shapes import Shape, placed
 
 
@@ -120,13 +122,12 @@ class Primitives(NamedTuple):
 
 
 def primitives(
-    near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int, clumps: Sequence[Form] = (), initial: int = 0,
-    polyhedra: tuple[Solid, ...] = (),
-) -> Primitives:  # fmt: skip
+    near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int, forms: tuple[Form, ...] = (), initial: int = 0
+) -> Primitives:
     """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies, for `Primitives.now`; the
     parts are in the frames of their bodies. `grains` is the number of grains on all ranks, of which those with ids
-    below `initial` may be `clumps`, and which may be `polyhedra`. ValueError if there are more than have names."""
-    table, count, hulls = near.bodies, near.grains + near.ghosts, hulls_of(polyhedra)
+    below `initial` may have `forms`. ValueError if there are more than have names."""
+    table, count, hulls = near.bodies, near.grains + near.ghosts, hulls_of(forms)
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
     parts_of = [shape for body in shapes for shape in body]
     kinds, centers, turns, sizes = zip(*(placed(shape) for shape in parts_of)) if parts_of else [()] * 4
@@ -141,7 +142,7 @@ def primitives(
         "size": (table.size, size),
     }
     after = grains + sum(spans)
-    numbers = after + more_numbers(clumps, initial)
+    numbers = after + more_numbers(forms, initial)
     if numbers > (most := most_numbers(hulls.features)):
         raise ValueError(
             f"{grains} grains and {numbers - grains} numbers of parts of bodies: their contacts have no keys; "
@@ -153,7 +154,7 @@ def primitives(
         radius=enclosing_radius(both["kind"], both["size"]),
         surfaces={count + n: shape.surface for n, shape in enumerate(parts_of) if isinstance(shape, Mesh)},
         hulls=hulls,
-        members=members(table.take(slice(0, count)), clumps, after) if clumps else None,
+        members=members(table.take(slice(0, count)), forms, after),
     )
 
 
@@ -183,8 +184,7 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
     spheres with spheres, half spaces and boxes come first, in the order of the pairs. With a course those that follow
     are of guests that are where `dem.contact.ahead.seen_from` puts them, with gaps that are wider by their ways.
 
-    Two half spaces have none, nor have meshes with polyhedra or meshes, and capsules with polyhedra that are no boxes:
-    `dem.scene` refuses those.
+    Two half spaces have none; other pairs that have none are refused by `refuse_untouchable`.
     """
     pair, point, normal, gap, others = touch_spheres(
         table.kind, table.center, table.quaternion, table.size, i, j, delta
@@ -266,3 +266,35 @@ _TOUCH: dict[tuple[int, int], tuple[Callable[..., Manifold], Callable[..., Any],
     (CAPSULE, MESH): (capsule_mesh, Primitives.capsule, None),
     (PLANE, MESH): (plane_mesh, Primitives.plane, None),
 }  # fmt: skip
+
+#: What messages call the kinds of pairs.
+_NAMES = {
+    SPHERE: "spheres", BOX: "boxes", CAPSULE: "capsules", _POLYHEDRON: "polyhedra", PLANE: "planes", MESH: "meshes",
+}  # fmt: skip
+
+
+def _can_touch(one: int, other: int) -> bool:
+    """Whether there are contacts of these kinds of pairs; of two half spaces there need be none."""
+    first = SPHERE in (one, other) and {one, other} <= {SPHERE, PLANE, BOX}  # `touch_spheres`
+    return first or one == other == PLANE or (one, other) in _TOUCH or (other, one) in _TOUCH
+
+
+def _in_pairs(kind: int) -> int:
+    """The kind that stands for one in `_TOUCH`; that of clumps is the one of their spheres."""
+    return _POLYHEDRON if kind >= POLYHEDRON else SPHERE if kind >= CLUMP else kind
+
+
+def refuse_untouchable(grains: Sequence[int], large_bodies: Sequence[LargeBody]) -> None:
+    """ValueError for kinds of grains, and shapes of large bodies, that might meet and have no contacts."""
+    of_grains = [(f"grains that are {_NAMES[kind]}", kind) for kind in sorted({_in_pairs(kind) for kind in grains})]
+    pairs = list(combinations_with_replacement(of_grains, 2))
+    shapes = [[(f"the {type(s).__name__.lower()} of {b.name!r}", placed(s)[0]) for s in b.shapes] for b in large_bodies]
+    pairs += [(grain, part) for parts in shapes for part in parts for grain in of_grains]
+    moves = [isinstance(body.motion, Dynamic) for body in large_bodies]
+    for one, other in combinations(range(len(shapes)), 2):
+        if moves[one] or moves[other]:
+            pairs += product(shapes[other], shapes[one])
+    for (first, kind), (second, host) in pairs:
+        if not _can_touch(kind, host):
+            allowed = [name for known, name in _NAMES.items() if _can_touch(known, host)]
+            raise ValueError(f"{first} cannot touch {second}: allowed are {', '.join(allowed)}")

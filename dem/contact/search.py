@@ -8,7 +8,7 @@ import numpy as np
 
 from dem import bodies
 from dem.arrays import Bools, Floats, Ints, Keys, places
-from dem.bodies import CAPSULE, CLUMP, MESH, SPHERE
+from dem.bodies import CAPSULE, FORM, MESH, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.ahead import Course
@@ -292,7 +292,7 @@ def ways(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
         radius = np.sqrt(size[n, 0] ** 2 + size[n, 1] ** 2 + size[n, 2] ** 2)
         if shape[n] == CAPSULE:
             radius = size[n, 0] + size[n, 1]
-        elif shape[n] >= CLUMP:
+        elif shape[n] >= FORM:
             radius = size[n, 0]
         if shape[n] != SPHERE:
             way += radius * spin

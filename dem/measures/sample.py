@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Bools, Floats, Ints
-from dem.bodies import CLUMP
+from dem.bodies import FORM
 from dem.measures.images import images
 from dem.shapes import solid
 
@@ -53,11 +53,11 @@ class Sample:
 
     @property
     def volume(self) -> Floats:
-        """Volumes (n,) of the grains, of clumps those of their unions [m^3]."""
+        """Volumes (n,) of the grains [m^3]."""
         out = np.zeros(len(self.shape))
         for kind in np.unique(self.shape):
             rows = self.shape == kind
-            if kind >= CLUMP:
+            if kind >= FORM:
                 out[rows] = 4.0 / 3.0 * np.pi * self.size[rows, 1] ** 3
             else:
                 out[rows] = solid(int(kind), self.size[rows], np.ones(rows.sum()))[0]

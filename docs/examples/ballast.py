@@ -30,11 +30,11 @@ ALLOWED = ("stones", "boxes", "spheres", *SHAPES)
 class Ballast(Experiment):
     """Stones fall into a box and settle; then a load presses a sleeper, which moves up and down only, into them."""
 
-    n: int = option(6, "", "stones along each side of the box")
-    radius: float = option(0.03, "m", "of the spheres that enclose the largest stones")
-    shape: str = option("stones", "", f"of the grains: {', '.join(ALLOWED)}")
-    load: float = option(1000.0, "N", "on the sleeper")
-    settling_time: float = option(0.6, "s", "when the load begins")
+    n: int = option(6, "stones along each side of the box")
+    radius: float = option(0.03, "of the spheres that enclose the largest stones", unit="m")
+    shape: str = option("stones", f"of the grains: {', '.join(ALLOWED)}")
+    load: float = option(1000.0, "on the sleeper", unit="N")
+    settling_time: float = option(0.6, "when the load begins", unit="s")
     dt = 0.0005
 
     def __post_init__(self) -> None:

@@ -22,11 +22,11 @@ from dem.shapes import Box, Plane
 class Plough(Experiment):
     """Spheres settle in a tray; then an oblique plate goes through them at constant speed."""
 
-    speed: float = option(0.2, "m/s", "of the plate, along x")
-    depth: float = option(0.025, "m", "of its lower edge above the floor")
-    rake: float = option(20.0, "degrees", "of the plate, from the vertical, its upper edge forwards")
-    friction: float = option(0.4, "", "friction coefficient of all contacts")
-    settling_time: float = option(0.4, "s", "when the plate starts")
+    speed: float = option(0.2, "of the plate, along x", unit="m/s")
+    depth: float = option(0.025, "of its lower edge above the floor", unit="m")
+    rake: float = option(20.0, "of the plate, from the vertical, its upper edge forwards", unit="degrees")
+    friction: float = option(0.4, "friction coefficient of all contacts")
+    settling_time: float = option(0.4, "when the plate starts", unit="s")
     dt = 0.005
     delta = 0.001
     radius, length, width = 0.005, 0.24, 0.1  # m; of a sphere, and of the tray

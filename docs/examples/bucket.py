@@ -29,10 +29,10 @@ ARM = 0.072  # from the axis to the middle of the bucket's bottom [m]
 class Bucket(Experiment):
     """Spheres settle in a tray; then a bucket at the end of an arm turns once about a horizontal axis."""
 
-    file: str = option("bucket.stl", "", "STL or OBJ file of the bucket, which opens along its z axis")
-    scale: float = option(1e-3, "m", "unit of the numbers in the file")
-    period: float = option(1.5, "s", "time of a turn")
-    friction: float = option(0.5, "", "friction coefficient of all contacts")
+    file: str = option("bucket.stl", "STL or OBJ file of the bucket, which opens along its z axis")
+    scale: float = option(1e-3, "unit of the numbers in the file", unit="m")
+    period: float = option(1.5, "time of a turn", unit="s")
+    friction: float = option(0.5, "friction coefficient of all contacts")
     dt = 0.005
     delta = 0.001
     settling_time = 0.4

@@ -19,8 +19,8 @@ from dem.shapes import Box
 class Conveyor(Experiment):
     """A belt of 2.1 m with guides on three sides, 1 m above the floor of the box at its end."""
 
-    speed: float = option(1.0, "m/s", "of the belt")
-    layers: int = option(5, "", "layers of 100 capsules")
+    speed: float = option(1.0, "of the belt", unit="m/s")
+    layers: int = option(5, "layers of 100 capsules")
 
     def build(self) -> Scene:
         """The scene, with the large bodies "belt", "guides" and "box"."""

@@ -22,12 +22,12 @@ from dem.scene import Scene
 class MixingDrum(Experiment):
     """Spheres fall into a drum, left ones and right ones of different materials; then it turns about the y axis."""
 
-    radius: float = option(0.06, "m", "radius of the drum")
-    length: float = option(0.05, "m", "length of the drum")
-    grain: float = option(0.004, "m", "radius of a sphere")
-    period: float = option(2.0, "s", "time of a turn")
-    friction: float = option(0.5, "", "friction coefficient between spheres, and on the side of the drum")
-    settling_time: float = option(0.3, "s", "when the drum begins to turn")
+    radius: float = option(0.06, "radius of the drum", unit="m")
+    length: float = option(0.05, "length of the drum", unit="m")
+    grain: float = option(0.004, "radius of a sphere", unit="m")
+    period: float = option(2.0, "time of a turn", unit="s")
+    friction: float = option(0.5, "friction coefficient between spheres, and on the side of the drum")
+    settling_time: float = option(0.3, "when the drum begins to turn", unit="s")
     dt = 0.005
     delta = 0.0008
 

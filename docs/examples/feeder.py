@@ -23,9 +23,9 @@ from dem.sources import Uniform
 class Feeder(Experiment):
     """A belt of 1 m with guides at its sides, at z = 0. What falls off it leaves half a metre below."""
 
-    rate: float = option(2.0, "kg/s", "that falls on the belt")
-    speed: float = option(0.8, "m/s", "of the belt")
-    radius: float = option(0.015, "m", "mean radius of the spheres; they are uniform within a third of it")
+    rate: float = option(2.0, "that falls on the belt", unit="kg/s")
+    speed: float = option(0.8, "of the belt", unit="m/s")
+    radius: float = option(0.015, "mean radius of the spheres; they are uniform within a third of it", unit="m")
 
     def build(self) -> Scene:
         """The scene, with the large bodies "belt" and "guides", the source "feed" and the outlet "end"."""

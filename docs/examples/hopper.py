@@ -23,11 +23,11 @@ from dem.shapes import Plane
 class Hopper(Experiment):
     """Spheres settle in a cylinder with a cone below; then the gate drops away."""
 
-    layers: int = option(12, "", "layers of spheres")
-    outlet: float = option(0.03, "m", "diameter of the outlet")
-    angle: float = option(35.0, "degrees", "of the cone, from the vertical")
-    friction: float = option(0.4, "", "friction coefficient of all contacts")
-    settling_time: float = option(0.35, "s", "when the gate opens")
+    layers: int = option(12, "layers of spheres")
+    outlet: float = option(0.03, "diameter of the outlet", unit="m")
+    angle: float = option(35.0, "of the cone, from the vertical", unit="degrees")
+    friction: float = option(0.4, "friction coefficient of all contacts")
+    settling_time: float = option(0.35, "when the gate opens", unit="s")
     dt = 0.004
     delta = 0.0006
     radii, wide = (0.0025, 0.0035), 0.04  # m; of the spheres, and of the cylinder

@@ -24,8 +24,8 @@ class Incline(Experiment):
     """A box and a sphere start at rest on a slope that falls along x; the slope is steep enough for the box to slide,
     and rough enough for the sphere to roll."""
 
-    angle: float = option(25.0, "degrees", "of the slope, from the horizontal")
-    friction: float = option(0.3, "", "friction coefficient of all contacts")
+    angle: float = option(25.0, "of the slope, from the horizontal", unit="degrees")
+    friction: float = option(0.3, "friction coefficient of all contacts")
     dt = 0.01
     delta = 0.005
     half, radius = 0.05, 0.05  # m

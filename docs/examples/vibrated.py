@@ -22,11 +22,11 @@ from dem.shapes import Plane
 class Vibrated(Experiment):
     """Spheres of two sizes settle in a box, which then oscillates upwards and downwards."""
 
-    n: int = option(8, "", "spheres along each side of the box")
-    radius: float = option(0.02, "m", "radius of a large sphere; a small one has half of it")
-    amplitude: float = option(0.01, "m", "of the oscillation")
-    frequency: float = option(10.0, "Hz", "of the oscillation")
-    settling_time: float = option(0.8, "s", "when the oscillation begins")
+    n: int = option(8, "spheres along each side of the box")
+    radius: float = option(0.02, "radius of a large sphere; a small one has half of it", unit="m")
+    amplitude: float = option(0.01, "of the oscillation", unit="m")
+    frequency: float = option(10.0, "of the oscillation", unit="Hz")
+    settling_time: float = option(0.8, "when the oscillation begins", unit="s")
     dt = 0.002
 
     def build(self) -> Scene:

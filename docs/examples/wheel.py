@@ -23,11 +23,11 @@ from dem.shapes import Box, Plane
 class Wheel(Experiment):
     """The axle turns at constant speed; the wheel moves freely up, down and forwards."""
 
-    spin: float = option(3.0, "rad/s", "speed of the axle")
-    mass: float = option(8.0, "kg", "of the wheel")
-    pull: float = option(5.0, "N", "load behind the wheel")
-    length: int = option(30, "", "spheres along the bin")
-    settling_time: float = option(0.5, "s", "when the axle begins to turn")
+    spin: float = option(3.0, "speed of the axle", unit="rad/s")
+    mass: float = option(8.0, "of the wheel", unit="kg")
+    pull: float = option(5.0, "load behind the wheel", unit="N")
+    length: int = option(30, "spheres along the bin")
+    settling_time: float = option(0.5, "when the axle begins to turn", unit="s")
 
     def build(self) -> Scene:
         """The scene, with the large bodies "bin" and "wheel"."""

@@ -71,8 +71,8 @@ class Stage:
         self._spheres = vtkOpenGLSphereMapper(scale_array="radius")  # round at any size, and thousands cost little
         self._boxes = _glyphs(surfaces.made(vtkCubeSource()))
         self._cylinders = _glyphs(surfaces.cylinder(0.5, 1.0, caps=False))
-        self._polyhedra = vtkPolyDataMapper()
-        for mapper in (self._spheres, self._boxes, self._cylinders, self._polyhedra):
+        self._facets = vtkPolyDataMapper()
+        for mapper in (self._spheres, self._boxes, self._cylinders, self._facets):
             mapper.SetScalarModeToUsePointFieldData()
             mapper.SelectColorArray("value")
             mapper.SetLookupTable(colours)
@@ -104,19 +104,19 @@ class Stage:
         # a capsule is a cylinder and two balls
         core = extent - [0, 0, 1] * extent[:, :1]
         tip = quaternion.rotate(turn[long], np.array([0, 0, 0.5]) * core[long])
-        clumps = surfaces.members(frame)
-        clump, member, radius = (column[shown[clumps[0]]] for column in clumps)
+        balls = surfaces.members(frame)
+        of_form, member, radius = (column[shown[balls[0]]] for column in balls)
         rows = np.concatenate([ball, long, long])
         centers = np.concatenate([place[ball], place[long] - tip, place[long] + tip, member])
         radii = np.concatenate([extent[rows, 0] / 2, radius]).astype(np.float32)
-        _show(self._spheres, centers, {"value": value[np.concatenate([rows, clump])], "radius": radii})
+        _show(self._spheres, centers, {"value": value[np.concatenate([rows, of_form])], "radius": radii})
         for mapper, rows, widths in ((self._boxes, block, extent), (self._cylinders, long, core)):
             _show(mapper, place[rows], {"value": value[rows], "extent": widths[rows], "turn": turn[rows]})
         grain, corners = surfaces.faces(frame)
         grain, corners = grain[shown[grain]], corners[shown[grain]]
-        polyhedra = surfaces.polydata(corners, "polys", 3)
-        surfaces.add_arrays(polyhedra.GetPointData(), {"value": np.repeat(value[grain], 3)})
-        self._polyhedra.SetInputDataObject(polyhedra)
+        facets = surfaces.polydata(corners, "polys", 3)
+        surfaces.add_arrays(facets.GetPointData(), {"value": np.repeat(value[grain], 3)})
+        self._facets.SetInputDataObject(facets)
         walls = scene.walls(frame)
         self._walls.SetInputDataObject(walls)
         self._edges.SetInputDataObject(surfaces.made(vtkFeatureEdges(coloring=False), walls))

@@ -17,7 +17,7 @@ from vtkmodules.vtkFiltersGeneral import vtkTransformFilter
 from vtkmodules.vtkFiltersSources import vtkCubeSource, vtkCylinderSource, vtkSphereSource
 
 from dem import quaternion
-from dem.bodies import BOX, CAPSULE, CLUMP, POLYHEDRON, SPHERE
+from dem.bodies import BOX, CAPSULE, SPHERE
 from pctt.disk import FileError
 from pctt.folder import Folder, Frame, Table
 
@@ -165,11 +165,9 @@ def _bounds(places: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def extent(path: Path, table: Table) -> np.ndarray:
-    """Widths (grains, 3) of the grains along their own axes, of clumps and polyhedra of the spheres about them [m]."""
+    """Widths (grains, 3) of the grains along their own axes, of forms those of the spheres about them [m]."""
     shape, size = table.shape[: table.grains, None], table.size[: table.grains]
-    clumps = range(CLUMP, CLUMP + len(table.clumps))
-    polyhedra = range(POLYHEDRON, POLYHEDRON + len(table.polyhedra))
-    unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE, *clumps, *polyhedra}
+    unknown = set(np.unique(shape).tolist()) - {SPHERE, BOX, CAPSULE, *(form["kind"] for form in table.forms)}
     if unknown:
         raise FileError(f"{path}: no surface is known for grains of shape {unknown.pop()}")
     round_ones = size[:, :1] + [0, 0, 1] * size[:, 1:2] * (shape == CAPSULE)
@@ -177,12 +175,12 @@ def extent(path: Path, table: Table) -> np.ndarray:
 
 
 def members(frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The spheres of all clumps: the row of the grain (m,), centres (m, 3) and radii (m,) [m]."""
+    """The spheres of all grains whose form has some: the row of the grain (m,), centres (m, 3) and radii (m,) [m]."""
     table = frame.table
     rows, places, radii = [np.zeros(0, int)], [np.zeros((0, 3))], [np.zeros(0)]
-    for number, clump in enumerate(table.clumps):
-        grains = np.flatnonzero(table.shape[: table.grains] == CLUMP + number)
-        for center, radius in zip(np.array(clump["centres"]), clump["radii"]):
+    for form in table.forms:
+        grains = np.flatnonzero(table.shape[: table.grains] == form["kind"])
+        for center, radius in zip(np.array(form.get("centres", ())), form.get("radii", ())):
             rows.append(grains)
             places.append(frame.position[grains] + quaternion.rotate(frame.quaternion[grains], center))
             radii.append(np.full(len(grains), radius))
@@ -190,12 +188,14 @@ def members(frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def faces(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """The triangles of all polyhedra: the row of the grain (m,) and the corners (m, 3, 3) [m]."""
+    """The triangles of all grains whose form has some: the row of the grain (m,) and the corners (m, 3, 3) [m]."""
     table = frame.table
     rows, corners = [np.zeros(0, int)], [np.zeros((0, 3, 3))]
-    for number, own in enumerate(table.polyhedra):
-        grains = np.flatnonzero(table.shape[: table.grains] == POLYHEDRON + number)
-        vertex, triangle = np.array(own["vertices"]), np.array(own["triangles"])
+    for form in table.forms:
+        if "triangles" not in form:
+            continue
+        grains = np.flatnonzero(table.shape[: table.grains] == form["kind"])
+        vertex, triangle = np.array(form["vertices"]), np.array(form["triangles"])
         scale = table.size[grains, 0] / np.linalg.norm(vertex, axis=1).max()
         places = quaternion.rotate(frame.quaternion[grains, None], scale[:, None, None] * vertex[None])
         corners.append((frame.position[grains, None] + places)[:, triangle].reshape(-1, 3, 3))

@@ -26,7 +26,6 @@ from dem.exchange import exchange
 from dem.experiment import Experiment
 from dem.motion import Dynamic
 from dem.period import lattice, velocity_in_cell, wrapped
-from dem.polyhedra import triangles
 from dem.scene import least_half
 from dem.shapes import described
 from dem.step import Step
@@ -196,9 +195,8 @@ class Writer:
                 rows = _by_id(world, TABLE[1:])
                 large = np.bytes_(json.dumps(described_bodies(world)))
                 shared = {"materials": texts(world.materials), "large": large}
-                for name, shapes in described_forms(world).items():
-                    if shapes:
-                        shared[name] = np.bytes_(json.dumps(shapes))
+                if world.forms:
+                    shared["forms"] = np.bytes_(json.dumps(described_forms(world)))
                 write_rows(table, self.comm, rows, shared, {})
         near = contacts.near.bodies
         rows = {
@@ -322,14 +320,9 @@ def described_bodies(world: World) -> list[dict[str, Any]]:
     return json.loads(json.dumps(large, default=list))  # arrays as lists
 
 
-def described_forms(world: World) -> dict[str, list[dict[str, Any]]]:
-    """In the frames of the grains, as JSON has them: "clumps", the centres [m] and radii [m] of the spheres of each,
-    and "polyhedra", the vertices [m] of each, times the scale of the grain, and the rows of these of its triangles."""
-    solids = [solid.faces for solid in world.polyhedra]
-    return {
-        "clumps": [{"centres": form.center.tolist(), "radii": form.radius.tolist()} for form in world.clumps],
-        "polyhedra": [{"vertices": own.vertex.tolist(), "triangles": triangles(own).tolist()} for own in solids],
-    }
+def described_forms(world: World) -> list[dict[str, Any]]:
+    """The kind of each form of grains, as of `dem.bodies`, and its surface in the frame of a grain of scale one."""
+    return [{"kind": form.BASE + n, **form.described()} for n, form in enumerate(world.forms)]
 
 
 def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:

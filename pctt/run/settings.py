@@ -13,7 +13,6 @@ import numpy as np
 from dem import time_step
 from dem.experiment import SCENE_FILE, Experiment, Given, SceneFileError, from_file
 from dem.scene import Scene
-from dem.scenes import SCENES
 from pctt import ccp
 from pctt.ccp.registry import why_no_form, why_refused
 from pctt.options import (
@@ -29,6 +28,7 @@ from pctt.options import (
     option,
     refuse_bad,
 )
+from pctt.scenes import SCENES
 
 #: By how much a contact may close in a step beyond what its spring gives, as a part of the contact distance.
 CLOSING = 0.15
@@ -208,7 +208,7 @@ class Run:
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Everything that a run of the program needs to know, with the scene's own values filled in; ``scene`` is an
-    instance of a class of ``dem.scenes.SCENES`` or of the user's class, ``given`` are the options as typed."""
+    instance of a class of ``pctt.scenes.SCENES`` or of the user's class, ``given`` are the options as typed."""
 
     run: Run
     scene: Any

@@ -25,11 +25,11 @@ from dem.contact import Contacts, find_contacts
 from dem.contact_map.halo import Halo, Messages
 from dem.morton import morton_codes
 from dem.partition import frame_of_most, redistribute, splitters
-from dem.scenes import Mixer
 from dem.unconstrained import unconstrained
 from dem.world import World
 from pctt import ccp
 from pctt.ccp.newton.multifrontal import MultifrontalFactors
+from pctt.scenes import Mixer
 
 BODY = 6 * 4  # bytes of a body's velocity or momentum in single precision, which is that of `apgd` to 2e-6
 BOXES = 8 * 6 * 8  # bytes of the boxes of a rank

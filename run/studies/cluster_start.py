@@ -20,8 +20,8 @@ import pctt
 from dem import exchange
 from dem.arrays import Rule
 from dem.contact import find_contacts
-from dem.scenes import Blade
 from dem.start import new_world
+from pctt.scenes import Blade
 
 PITCH, PERTURBATION = 0.205, 0.002  # [m]: gaps are below the contact distance, so that the lattice has its contacts
 

@@ -49,13 +49,13 @@ from dem.contact import Contacts, find_contacts
 from dem.contact_map import ContactMap
 from dem.motion import Fixed
 from dem.scene import Scene
-from dem.scenes import Mixer
 from dem.shapes import Box, Plane
 from dem.start import new_world
 from dem.system import ContactSystem, contact_frames
 from dem.unconstrained import unconstrained
 from dem.world import World
 from pctt import ccp
+from pctt.scenes import Mixer
 
 COMM = MPI.COMM_SELF
 TOLERANCES = (1e-4, 1e-6)

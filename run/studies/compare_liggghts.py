@@ -41,7 +41,7 @@ import shared
 from scipy.spatial import cKDTree
 from shared import Row, Table, settings_of, settled, spread
 
-from dem.scenes import Mixer
+from pctt.scenes import Mixer
 
 FORGETS = 0.1  # [s] from the start, not part of means and overlaps
 SAMPLES = 0.025  # [s] between two samples of positions

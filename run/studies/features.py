@@ -26,8 +26,8 @@ from dem.measures import Block
 from dem.motion import Dynamic
 from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes import PlaneShear
 from dem.shapes import Box, Clump, Plane
+from pctt.scenes import PlaneShear
 
 SIDE, RADIUS, FIRST = 8, 0.005, 40
 WIDTH = 2.1 * RADIUS * SIDE

@@ -23,7 +23,7 @@ from shared import Table, at_least_one, parser, record, say_machine, spread
 import pctt
 from dem.experiment import option
 from dem.scene import Scene
-from dem.scenes import Incline
+from pctt.scenes import Incline
 
 FLOWS, ABOVE = 2.0, 3.0  # s at the first angle; degrees of it above the law
 SLOW, LASTING = 0.01, 0.5  # of sqrt(g d); s
@@ -35,7 +35,7 @@ LOW, HIGH, LENGTH = 20.9, 32.8, 1.65  # degrees, degrees, diameters
 class Levelled(Incline):
     """An incline whose angle falls after a while."""
 
-    fall: float = option(0.5, "deg/s", "rate at which the angle falls after two seconds")
+    fall: float = option(0.5, "rate at which the angle falls after two seconds", unit="deg/s")
 
     def angle_at(self, time: float) -> float:
         """[degrees]"""

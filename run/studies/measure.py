@@ -191,7 +191,7 @@ def pdip(given: Namespace, about: Row) -> None:
     from petsc4py import PETSc
     from shared import next_problem, settled
 
-    import dem.scenes
+    import pctt.scenes
     from pctt import ccp
 
     table = Table(
@@ -200,7 +200,7 @@ def pdip(given: Namespace, about: Row) -> None:
     )  # fmt: skip
     rows: list[Row] = []
     for scene, n in [(scene, n) for n in given.n for scene in SCENES]:
-        sim = settled(getattr(dem.scenes, scene.title())(n=n), dt=0.025, solver="apgd", stiffness=np.inf)
+        sim = settled(getattr(pctt.scenes, scene.title())(n=n), dt=0.025, solver="apgd", stiffness=np.inf)
         with next_problem(sim) as problem:
             spent: dict[str, list[float]] = {way: [] for way in WAYS}
             for way in (*WAYS, *WAYS) if n < 16 else WAYS:

@@ -10,11 +10,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from shared import next_problem, settled
 
-from dem.scenes import Mixer
 from pctt import ccp
 from pctt.ccp.interior.pdip import PDIP
 from pctt.ccp.newton.forms import ContactForm
 from pctt.ccp.newton.kkt import KKT
+from pctt.scenes import Mixer
 
 COMM = MPI.COMM_SELF
 TOL = 1e-4  # natural residual at which the Newton systems end

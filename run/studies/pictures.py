@@ -22,7 +22,7 @@ from pathlib import Path
 
 from shared import MPIEXEC, PYTHON, ROOT, parser, reduce_colours
 
-from dem.scenes import SCENES
+from pctt.scenes import SCENES
 
 EXAMPLES = ROOT / "docs" / "examples"
 GALLERY = ROOT / "docs" / "gallery.json"

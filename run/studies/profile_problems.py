@@ -42,11 +42,11 @@ from shared import (
 )
 
 from dem.contact import find_contacts
-from dem.scenes import Mixer
 from dem.unconstrained import unconstrained
 from pctt import ccp
 from pctt.ccp import fclib
 from pctt.ccp.fclib import FileFormatError
+from pctt.scenes import Mixer
 
 SUFFIXES = (".dat", ".hdf5", ".h5")
 TOLERANCES = (1e-4, 1e-6, 1e-8)

@@ -36,9 +36,9 @@ import shared
 from shared import Row, Table, settings_of, settled
 
 from dem.experiment import Experiment
-from dem.scenes import Blade, Drum, Mixer, Shear, Silo
 from dem.time_step import recommended
 from dem.together import SceneError
+from pctt.scenes import Blade, Drum, Mixer, Shear, Silo
 
 MOVED = 1e-4  # of a radius
 FORGETS = 0.1  # [s] from the start, not part of overlaps

@@ -48,8 +48,8 @@ class Plant(Experiment):
     """Grains fall from a source beside a paddle, a mesh that turns, and a chain that a motor swings; or, as a cell,
     they are sheared under a given stress."""
 
-    n: int = option(4, "", "size: of the source, or of the cell in diameters")
-    cell: bool = option(False, "", "the cell")
+    n: int = option(4, "size: of the source, or of the cell in diameters")
+    cell: bool = option(False, "the cell")
 
     def build(self) -> Scene:
         """The scene, with the large bodies "floor" and "paddle", or none."""

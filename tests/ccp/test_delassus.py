@@ -116,7 +116,7 @@ def test_a_shape_that_does_not_fit_on_one_rank_is_refused_on_all():
     known, graph = heap()
     problem = from_graph(known, graph, MPI.COMM_WORLD)
     mu = problem.mu[1:] if MPI.COMM_WORLD.rank else problem.mu
-    with pytest.raises(ValueError, match=r"mu has the shape \(19,\); .*r has 20 contacts \(on rank 1\)"):
+    with pytest.raises(ValueError, match=r"mu has the shape \(19,\); .*r has 20 contacts \(on rank 1 of 2\)"):
         ConeProblem(MPI.COMM_WORLD, problem.r, mu, G=problem.contact_map.given)
 
 

@@ -9,11 +9,11 @@ from petsc4py import PETSc
 from problems import from_graph, heap
 
 import pctt
-from dem.scenes import Mixer
 from pctt import ccp
 from pctt.ccp import Comparison, Limits
 from pctt.ccp.newton.krylov import Krylov
 from pctt.ksp_options import unused
+from pctt.scenes import Mixer
 
 SELF = MPI.COMM_SELF
 OF_HOST = {

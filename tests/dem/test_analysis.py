@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dem import analysis
-from dem.scenes import Blade, Shear
+from pctt.scenes import Blade, Shear
 
 TIME = np.arange(0.0, 8.0, 0.01)
 

@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 import pctt
 from dem import measures
-from dem.scenes import PlaneShear, Triaxial
+from pctt.scenes import PlaneShear, Triaxial
 
 SMALL = Triaxial(n=6, height=1.0, fraction=0.58, start=0.08, strain_rate=1.0)
 LOOSE = Triaxial(n=6, height=1.0, fraction=0.4, start=0.008, strain_rate=1.0)  # a packing that is made at once

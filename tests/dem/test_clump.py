@@ -78,8 +78,8 @@ def test_the_frame_goes_to_the_centre_of_mass():
     ids = scene.add_clumps([(1, 2, 3), (4, 5, 6)], shape, 1000.0, quaternions=turn)
     scene.add_clumps((7, 8, 9), Clump([(0, 0, 0), (0.1, 0.2, 0), (0.1, 0.2, 0.3)], [0.05, 0.08, 0.06]), 500.0)
     assert ids.tolist() == [0, 1]
-    assert len(scene.clumps) == 1
-    grains, form = scene.grains(), scene.clumps[0]
+    assert len(scene.forms) == 1
+    grains, form = scene.grains(), scene.forms[0]
     assert (grains.shape == CLUMP).all()
     for n, (origin, own) in enumerate([((1, 2, 3), turn), ((4, 5, 6), turn), ((7, 8, 9), np.array([1.0, 0, 0, 0]))]):
         found = grains.position[n] + quaternion.rotate(grains.quaternion[n], form.center)
@@ -144,7 +144,7 @@ def test_contacts_are_those_of_the_spheres():
     assert len(np.unique(found.key)) == len(found)
     grains, place, radius, of = world.grains, [], [], []
     for n in range(len(grains)):
-        form = scene.clumps[grains.shape[n] - CLUMP] if grains.shape[n] >= CLUMP else None
+        form = scene.forms[grains.shape[n] - CLUMP] if grains.shape[n] >= CLUMP else None
         at = grains.position[n][None] if form is None else spheres_of(grains.take([n]), form)[0]
         place.append(at)
         radius.append(grains.size[n, :1] if form is None else form.radius)
@@ -192,7 +192,7 @@ def test_volumes_are_those_of_the_unions():
     scene.add_spheres((0, 1, 0), 0.1, 1000.0)
     sim = Simulation(scene, dt=0.01)
     sim.step()
-    form = scene.clumps[0]
+    form = scene.forms[0]
     np.testing.assert_allclose(sim.sample.volume, [form.volume, form.volume, 4 / 3 * np.pi * 1e-3], rtol=1e-13)
     region = Block((-0.5, -0.5, -0.5), (1.5, 0.5, 0.5))
     np.testing.assert_allclose(solid_fraction(sim.sample, region), 2 * form.volume / 2.0, rtol=1e-13)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dem.exchange import exchange, reduced
+from dem.exchange import agreed, exchange, reduced, refuse
 
 
 @pytest.mark.parallel(1, 2, 3, 4)
@@ -43,3 +43,21 @@ def test_sums_and_greatest_numbers_by_one_reduction():
     assert reduced(comm, (), np.array([comm.rank])) == ([], [comm.size - 1])
     sums, _ = reduced(comm, np.full(2000, 1.0 + comm.rank), ())
     assert sums == [float((1 + ranks).sum())] * 2000
+
+
+@pytest.mark.parallel(1, 3)
+def test_an_error_of_some_ranks_is_one_of_all():
+    comm = MPI.COMM_WORLD
+    assert agreed(comm, lambda: comm.rank) == comm.rank
+
+    def work():
+        if comm.rank != 1:
+            raise KeyError("mine")
+
+    where = "" if comm.size == 1 else r" \(on ranks 0, 2 of 3\)"
+    with pytest.raises(ValueError, match=f"^read: 'mine'{where}$"):
+        agreed(comm, work, (KeyError,), lambda error: (ValueError, f"read: {error}"))
+    refuse(comm, "")
+    if comm.size > 1:
+        with pytest.raises(ValueError, match=r"^2 is odd \(on rank 1 of 3\); another failure on rank 2$"):
+            refuse(comm, f"{2 * comm.rank} is odd" if comm.rank else "")

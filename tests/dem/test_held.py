@@ -13,9 +13,9 @@ from dem import quaternion
 from dem.mesh import Mesh
 from dem.motion import Dynamic, Held
 from dem.scene import Scene
-from dem.scenes import Belt, Wheel
 from dem.shapes import Box, Plane, Sphere
 from dem.together import SceneError
+from pctt.scenes import Belt, Wheel
 
 SELF, WORLD, DT, G, MU = MPI.COMM_SELF, MPI.COMM_WORLD, 0.005, 9.81, 0.3
 

@@ -6,9 +6,9 @@ from mpi4py import MPI
 
 import pctt
 from dem.scene import Scene
-from dem.scenes import Incline
 from dem.shapes import Box, Plane, Sphere
 from dem.together import SceneError
+from pctt.scenes import Incline
 
 CELL = (0.9, 1.1, 1.3)
 

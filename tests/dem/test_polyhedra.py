@@ -15,7 +15,7 @@ from dem.contact.narrow import CORNERS, Spheres
 from dem.contact.polyhedra import FLUSH, ROUND, SNAP, Polyhedra, hulls_of, polyhedra_polyhedra, spheres_polyhedra
 from dem.polyhedra import solid
 from dem.scene import Scene
-from dem.shapes import Box, Capsule, Mesh, Plane
+from dem.shapes import Box, Plane
 from dem.start import new_world
 
 TETRAHEDRON = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / 3**0.5
@@ -54,8 +54,8 @@ def test_grains_stay_where_their_vertices_were_given():
     ids = scene.add_polyhedra([(1, 2, 3), (4, 5, 6)], wedge, 1000.0, scale=scale, quaternions=turn)
     scene.add_polyhedra((7, 8, 9), wedge, 500.0)
     assert ids.tolist() == [0, 1]
-    assert len(scene.polyhedra) == 1
-    grains, form = scene.grains(), scene.polyhedra[0]
+    assert len(scene.forms) == 1
+    grains, form = scene.grains(), scene.forms[0]
     assert (grains.shape == POLYHEDRON).all()
     np.testing.assert_allclose(grains.mass, 3.0 * np.array([1, 8, 0.5]), rtol=1e-13)
     for n in range(2):
@@ -84,19 +84,6 @@ def test_grains_stay_where_their_vertices_were_given():
 def test_bad_vertices(vertices, match):
     with pytest.raises(ValueError, match=match):
         Scene(0.3).add_polyhedra((0, 0, 0), vertices, 1000.0)
-
-
-def test_pairs_without_contacts_are_refused():
-    for add, match in (
-        (lambda scene: scene.add_capsules((9, 9, 9), 0.1, 0.1, 1000.0), "grains that are capsules"),
-        (lambda scene: scene.add_body("arm", [Capsule(0.1, 0.1)]), "capsule of 'arm'"),
-        (lambda scene: scene.add_body("drum", [Mesh(np.eye(3), [(0, 1, 2)])]), "polyhedra cannot touch the mesh"),
-    ):
-        scene = Scene(0.3)
-        scene.add_polyhedra((0, 0, 0), OCTAHEDRON, 1000.0)
-        add(scene)
-        with pytest.raises(ValueError, match=match):
-            scene.grains()
 
 
 def signed_distance(one, other):

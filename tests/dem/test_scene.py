@@ -13,11 +13,11 @@ from dem.bodies import bounding_radius
 from dem.motion import Dynamic, Glide, Guided, Hinged, Oscillation, Path, Rotation
 from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes import Mixer
 from dem.shapes import Box, Plane, Sphere
 from dem.start import new_world
 from dem.stiffness import pairs
 from dem.time_step import fastest, smallest
+from pctt.scenes import Mixer
 
 SELF = MPI.COMM_SELF
 

@@ -9,9 +9,9 @@ import pytest
 from mpi4py import MPI
 
 from dem.contact import find_contacts
-from dem.scenes import SCENES, Blade, Drum, Mixer, Shear, Silo
 from dem.start import new_world
 from dem.unconstrained import unconstrained
+from pctt.scenes import SCENES, Blade, Drum, Mixer, Shear, Silo
 
 SELF = MPI.COMM_SELF
 SMALL = [Blade(n=2), Shear(n=1), Shear(n=2), Mixer(n=2)]

@@ -7,10 +7,10 @@ from mpi4py import MPI
 import pctt
 from dem.contact_map.cell import CellMap
 from dem.scene import Scene
-from dem.scenes import PlaneShear
 from dem.servo import CLOSING, KEPT, LEADING
 from dem.shapes import Plane
 from pctt.ccp.delassus import BlockMap
+from pctt.scenes import PlaneShear
 
 PRESSURE = 1000.0
 OF_RUNS = {"dt": 0.001, "solver": "apgd", "tol": 1e-6}

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from several_ranks import environment, mpiexec
 
-from dem.scenes import Mixer
 from pctt.disk import FileError
 from pctt.folder import Folder
+from pctt.scenes import Mixer
 
 
 def test_a_run_tells_the_shapes_of_its_bodies(folder):

@@ -130,7 +130,7 @@ def test_a_checkpoint_of_other_clumps_is_refused(tmp_path):
     with pctt.Simulation(scene(TRIPOD), dt=DT) as sim:
         sim.step()
         sim.save(tmp_path / "state.h5")
-    with pytest.raises(Exception, match="clump"):
+    with pytest.raises(Exception, match="form of a grain"):
         pctt.Simulation.load(tmp_path / "state.h5", scene(DUMBBELL), dt=DT)
 
 
@@ -168,7 +168,7 @@ def test_files_have_the_spheres(tmp_path):
         sim.write(tmp_path / "run", every=1)
         sim.run(steps=2)
         sim.complete()
-        place, turn, forms = sim.positions, sim.orientations, sim.world.clumps
+        place, turn, forms = sim.positions, sim.orientations, sim.world.forms
         pixels = sim.render().pixels
         assert pixels.ndim == 3
         assert pixels.std() > 0

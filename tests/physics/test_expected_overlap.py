@@ -11,10 +11,10 @@ from mpi4py import MPI
 import pctt
 from dem.motion import Dynamic, Guided
 from dem.scene import Scene
-from dem.scenes import Mixer
 from dem.shapes import Box, Plane
 from dem.stiffness import recommended
 from dem.time_step import recommended as recommended_step
+from pctt.scenes import Mixer
 
 FLAT = (np.cos(np.pi / 4), 0.0, np.sin(np.pi / 4), 0.0)
 NEEDLE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-1e-3, 1e-3) for z in (-1e-3, 1e-3)])

@@ -11,9 +11,9 @@ import pctt
 from dem import quaternion
 from dem.motion import Glide, Rotation
 from dem.scene import Scene
-from dem.scenes.mixer import Mixer
 from dem.shapes import Box, Capsule, Plane
 from dem.start import new_world
+from pctt.scenes.mixer import Mixer
 
 EXACT = {"tol": 1e-10, "closing_work": np.inf, "solver": "apgd"}
 DT, DELTA = 0.025, 0.01  #: at 4 m/s a body moves ten times the contact distance in a step

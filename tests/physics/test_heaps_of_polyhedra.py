@@ -120,7 +120,7 @@ def test_a_checkpoint_of_other_polyhedra_is_refused(tmp_path):
     with pctt.Simulation(scene(TETRAHEDRON), dt=DT) as sim:
         sim.step()
         sim.save(tmp_path / "state.h5")
-    with pytest.raises(Exception, match="polyhedron"):
+    with pytest.raises(Exception, match="form of a grain"):
         pctt.Simulation.load(tmp_path / "state.h5", scene(OCTAHEDRON), dt=DT)
 
 
@@ -151,7 +151,7 @@ def test_files_and_pictures_have_the_surfaces(tmp_path):
     frame = folder.frame(2)
     scene = surfaces.Scene(folder, [frame])
     found = surfaces.triangles(series("polyhedra", scene, frame))
-    forms = [world.polyhedra[k] for k in (0, 0, 1, 1, 2, 2)]
+    forms = [world.forms[k] for k in (0, 0, 1, 1, 2, 2)]
     scale = [frame.table.size[n, 0] / form.size[0] for n, form in enumerate(forms)]
     expected = np.concatenate(
         [place[n] + quaternion.rotate(turn[n], scale[n] * form.faces.vertex) for n, form in enumerate(forms)]

@@ -14,8 +14,8 @@ from drive import by_id, steps
 from mpi4py import MPI
 from several_ranks import alone
 
-from dem.scenes import Mixer
 from dem.start import new_world, restart_rows, restored_world
+from pctt.scenes import Mixer
 
 # settings, and ten times what was measured between ranks (of six states `pdip` leaves 4e-7 to 1.4e-5 m): m, m/s, rad/s
 CASES = {

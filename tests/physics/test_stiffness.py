@@ -8,10 +8,10 @@ import pytest
 import pctt
 from dem.motion import Glide, Rotation
 from dem.scene import Scene
-from dem.scenes import Mixer
 from dem.shapes import Box, Plane
 from dem.stiffness import DAMPING, RESISTS, STOPPED, compliance, expected_overlap, of_youngs_modulus, pairs, recommended
 from pctt import ccp
+from pctt.scenes import Mixer
 
 R, DENSITY, G = 0.1, 2500.0, 9.81
 MASS = DENSITY * 4 / 3 * np.pi * R**3

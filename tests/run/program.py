@@ -32,7 +32,7 @@ from dem.shapes import Plane
 
 @dataclass(frozen=True)
 class Drop(Experiment):
-    height: float = option(0.2, "m", "of the lowest centre")
+    height: float = option(0.2, "of the lowest centre", unit="m")
 
     def build(self):
         scene = Scene(friction=0.3)

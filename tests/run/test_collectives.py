@@ -9,8 +9,8 @@ import pytest
 from mpi4py import MPI
 
 import pctt
-from dem.scenes import Mixer
 from pctt import ccp
+from pctt.scenes import Mixer
 
 COLLECTIVE = {
     *("allgather", "Allgather", "Allgatherv", "allreduce", "Allreduce", "alltoall", "Alltoall", "Alltoallv"),

@@ -9,7 +9,7 @@ import compare_liggghts
 import numpy as np
 import pytest
 
-from dem.scenes import Mixer
+from pctt.scenes import Mixer
 
 
 def start(position, angle=0.0):

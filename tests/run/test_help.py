@@ -15,10 +15,10 @@ from petsc4py import PETSc
 from program import ROOT, SMALL, command, environment
 
 import pctt
-from dem.scenes import Mixer
 from pctt import ccp
 from pctt.pc import BlockICC, TensorTrain
 from pctt.run.settings import Run, Settings
+from pctt.scenes import Mixer
 
 GROUPS = [(Run, ""), (Mixer, "scene_"), (Settings, "ccp_")]
 GROUPS += [(solver.options, f"ccp_{name}_") for name, solver in ccp.SOLVERS.items()]

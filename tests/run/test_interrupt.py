@@ -86,7 +86,7 @@ def test_an_interrupted_run_goes_on(number, ranks, program, tmp_path, cache):
 def test_the_same_signal_again_ends_a_run_at_once(program, tmp_path, cache):
     """A sleeping scene: its step does not end."""
     (tmp_path / "mine.py").write_text(
-        "import time\nfrom dem.scenes.mixer import *\n"
+        "import time\nfrom pctt.scenes.mixer import *\n"
         "@dataclass(frozen=True)\nclass Sleeper(Mixer):\n"
         "    def record(self, step):\n        open('asleep', 'w').close()\n        time.sleep(100)\n        return {}\n"
     )

@@ -7,8 +7,8 @@ import pytest
 from mpi4py import MPI
 from program import assert_same_bits
 
-from dem.scenes import Drum
 from pctt.folder import Folder
+from pctt.scenes import Drum
 
 DRUM = ("-scene", "drum", "-scene_n", 4, "-scene_length", 2, "-scene_fill", 0.15, "-ccp_type", "apgd", "-delta", 0.003)
 DRUM = (*DRUM, "-output_every", 1)

@@ -69,7 +69,7 @@ DIVISION = "ZeroDivisionError: division by zero"
 
 def fault(what: str, error: str = DIVISION, ranks: str = "rank 1") -> tuple[str, str]:
     """The exception that all of three ranks raise, and its words; {file} and {line} are those of the failure."""
-    return "SceneError", f"{{file}}, line {{line}}: {what}: {error}" + (f" ({ranks} of 3)" if ranks else "")
+    return "SceneError", f"{{file}}, line {{line}}: {what}: {error}" + (f" (on {ranks} of 3)" if ranks else "")
 
 
 def refusal(words: str) -> tuple[str, str]:
@@ -92,16 +92,16 @@ CASES = [
     (scene("record", (2,), "raise GeneratorExit"), fault(RECORD, "GeneratorExit", "rank 2")),
     (
         scene("build", (0, 1, 2), "raise (OSError, KeyError, KeyError)[rank]('no luck')"),
-        fault(BUILD, "OSError: no luck (rank 0 of 3); another failure on ranks 1, 2", ""),
+        fault(BUILD, "OSError: no luck (on rank 0 of 3); another failure on ranks 1, 2", ""),
     ),
-    (scene("import", (2,)), refusal(f"-scene {{file}}: line {{line}}: {DIVISION} (rank 2 of 3)")),
+    (scene("import", (2,)), refusal(f"-scene {{file}}: line {{line}}: {DIVISION} (on rank 2 of 3)")),
     (
         scene("import", (0,), "raise SystemExit"),
-        refusal("-scene {file}: line {line}: SystemExit (rank 0 of 3)"),
+        refusal("-scene {file}: line {line}: SystemExit (on rank 0 of 3)"),
     ),
     (
         scene("post_init", (1,), "raise ValueError('height of nothing')"),
-        refusal("-scene_height of nothing (rank 1 of 3)"),
+        refusal("-scene_height of nothing (on rank 1 of 3)"),
     ),
     (scene("post_init", (1,), "raise ValueError('a bug')"), fault(OPTIONS, "ValueError: a bug")),
     (

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from program import SETTLED, SMALL, arrays, command, environment, steps_of, summary_of
 
-from dem.scenes import Mixer
+from pctt.scenes import Mixer
 
 STEP = {
     "step": int,

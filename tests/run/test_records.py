@@ -8,7 +8,7 @@ import pytest
 from mpi4py import MPI
 from program import SETTLED, steps_of, summary_of, table
 
-from dem.scenes import Shear
+from pctt.scenes import Shear
 from pctt.simulation import Simulation
 
 APGD = ("-ccp_type", "apgd")

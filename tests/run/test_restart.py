@@ -33,13 +33,13 @@ from sealed import edited
 import pctt
 from dem.experiment import Experiment
 from dem.scene import Scene
-from dem.scenes import Mixer
 from dem.shapes import Plane
 from pctt.disk import FileError, Lock
 from pctt.folder import Folder
 from pctt.options import OptionError
 from pctt.run.settings import Settings
 from pctt.run.state import origin, settled_path, unfinished
+from pctt.scenes import Mixer
 from pctt.simulation import Simulation
 
 

@@ -23,13 +23,13 @@ from mpi4py import MPI
 from program import database
 from test_pages import blocks, stored_problem
 
-from dem.scenes import SCENES
 from pctt import export, plot, render
 from pctt.ksp_options import OF_SOLVERS
 from pctt.options import describe
 from pctt.run.help import help_text
 from pctt.run.options import option_groups, read_options
 from pctt.run.settings import find_scene
+from pctt.scenes import SCENES
 
 ROOT = Path(__file__).resolve().parents[2]
 OF_THE_PAST = ("changelog", "notebook")  # pages that tell of what was

@@ -16,7 +16,6 @@ import pctt
 from dem.experiment import Experiment, option
 from dem.motion import Fixed, Glide, Guided, Hinged, Oscillation, Rotation
 from dem.scene import Scene
-from dem.scenes import Mixer
 from dem.shapes import Box, Plane
 from dem.together import SceneError
 from pctt.ccp.first_order.apgd import APGD
@@ -24,6 +23,7 @@ from pctt.disk import FileError
 from pctt.options import OptionError
 from pctt.run.options import read_options
 from pctt.run.simulate import simulate
+from pctt.scenes import Mixer
 
 SELF, WORLD, G = MPI.COMM_SELF, MPI.COMM_WORLD, 9.81
 
@@ -54,7 +54,7 @@ def moved(motion, **more):
 class Stirred(Experiment):
     """Spheres in a box with a plate that a servo turns."""
 
-    speed: float = option(1.0, "rad/s", "of the servo")
+    speed: float = option(1.0, "of the servo", unit="rad/s")
     dt = 0.01
     delta = 0.01
 
@@ -243,7 +243,7 @@ def test_the_options_of_petsc_stay_as_they_are(solver, tmp_path):
 
 PLAIN = """
 import sys
-from dem.scenes import Mixer
+from pctt.scenes import Mixer
 from pctt.run import help, simulate
 from pctt.simulation import Simulation
 Simulation(Mixer(n=1), solver="apgd").run(steps=1)
@@ -459,7 +459,7 @@ def test_an_error_of_one_rank_is_one_of_all():
             raise KeyError("mine")
         return sim.positions.sum() > 0
 
-    with pytest.raises(SceneError, match="call or stop of run: KeyError: 'mine' .rank 1 of 2."):
+    with pytest.raises(SceneError, match="call or stop of run: KeyError: 'mine' .on rank 1 of 2."):
         sim.run(steps=2, stop=bad)
     with pytest.raises(OptionError, match="tol"):
         pctt.Simulation(Stirred(), tol=2.0 if WORLD.rank else 1e-3)

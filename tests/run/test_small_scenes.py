@@ -8,10 +8,10 @@ from mpi4py import MPI
 
 from dem.motion import Dynamic, Glide, Guided
 from dem.scene import Scene
-from dem.scenes import Mixer
 from dem.shapes import Box
 from pctt.options import OptionError
 from pctt.run.state import world_at_start
+from pctt.scenes import Mixer
 from pctt.simulation import Simulation
 
 

@@ -8,11 +8,11 @@ import numpy as np
 from shared import next_problem, settled
 
 from dem.contact import find_contacts
-from dem.scenes import SCENES
 from dem.system import ContactSystem
 from dem.unconstrained import unconstrained
 from pctt import ccp
 from pctt.body_matrix import BodyOperator
+from pctt.scenes import SCENES
 
 
 class Mixer:

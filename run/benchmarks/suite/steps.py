@@ -7,8 +7,8 @@ import warnings
 
 from mpi4py import MPI
 
-from dem.scenes import SCENES
 from pctt import Simulation
+from pctt.scenes import SCENES
 
 BEFORE = 40  # steps from the start, within which grains fall onto each other
 SIZE = {"mixer": 4}  # else the scene's own

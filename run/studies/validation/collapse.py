@@ -21,12 +21,12 @@ RADIUS = 0.005  # of the greatest spheres [m]
 class Collapse(Experiment):
     """Spheres of 8 to 10 mm in a cylinder without friction, on a floor with that of the spheres."""
 
-    friction: float = option(0.5, "", "friction coefficient between spheres, and of the floor")
-    rolling: float = option(0.1, "", "resistance to rolling on the floor, over the radius of the greatest")
-    width: float = option(8.0, "sphere diameters", "radius of the cylinder", positive)
-    aspect: float = option(1.0, "", "about the height of the bed over the radius of the cylinder", positive)
-    seed: int = option(1, "", "seed of the places and of the radii")
-    gate_speed: float = option(3.0, "m/s", "of the wall, upwards", positive)
+    friction: float = option(0.5, "friction coefficient between spheres, and of the floor")
+    rolling: float = option(0.1, "resistance to rolling on the floor, over the radius of the greatest")
+    width: float = option(8.0, "radius of the cylinder", unit="sphere diameters", check=positive)
+    aspect: float = option(1.0, "about the height of the bed over the radius of the cylinder", check=positive)
+    seed: int = option(1, "seed of the places and of the radii")
+    gate_speed: float = option(3.0, "of the wall, upwards", unit="m/s", check=positive)
     dt = 0.004
     delta = 0.001
     settling_time = 0.5

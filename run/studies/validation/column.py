@@ -20,11 +20,11 @@ RADIUS = 0.005  # of a sphere [m]
 class Column(Experiment):
     """Spheres in a cylinder, a mesh; the bottom is a plane."""
 
-    friction: float = option(0.5, "", "friction coefficient between spheres")
-    wall_friction: float = option(0.5, "", "friction coefficient of the wall")
-    width: float = option(4.0, "sphere diameters", "radius of the cylinder")
-    layers: int = option(28, "", "layers of the lattice")
-    speed: float = option(0.005, "m/s", "of the bottom, downwards")
+    friction: float = option(0.5, "friction coefficient between spheres")
+    wall_friction: float = option(0.5, "friction coefficient of the wall")
+    width: float = option(4.0, "radius of the cylinder", unit="sphere diameters")
+    layers: int = option(28, "layers of the lattice")
+    speed: float = option(0.005, "of the bottom, downwards", unit="m/s")
     dt = 0.005
     delta = 0.001
     settling_time = 0.6

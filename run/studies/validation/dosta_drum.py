@@ -27,8 +27,8 @@ class DostaDrum(Experiment):
     The drum turns about -y: its side goes up at x > 0.
     """
 
-    length: float = option(0.012, "m", "length of the drum")
-    seed: int = option(1, "", "seed of the places at the start")
+    length: float = option(0.012, "length of the drum", unit="m")
+    seed: int = option(1, "seed of the places at the start")
     dt = 0.002
     delta = 0.0002
     settling_time = 0.4

@@ -8,7 +8,7 @@ from dem.arrays import Floats
 from dem.checks import not_negative
 from dem.experiment import option
 from dem.scene import Scene
-from dem.scenes.silo import Silo
+from pctt.scenes.silo import Silo
 
 
 @dataclass(frozen=True)
@@ -16,16 +16,18 @@ class DostaSilo(Silo):
     """Orifice and cone have the published size. The silo is narrower, and the bed is less deep: 100,000 spheres in a
     silo of 200 mm there."""
 
-    n: int = option(13, "", "radius of the silo in diameters of a sphere; 25 there")
-    radius: float = option(0.002, "m", "radius of the spheres")
-    friction: float = option(0.3, "", "friction coefficient between spheres: of M1", not_negative)
-    wall_friction: float = option(0.2, "", "friction coefficient of steel", not_negative)
-    bounce: float = option(0.5, "", "restitution between spheres: of M1", not_negative)
-    wall_bounce: float = option(0.4, "", "restitution of steel", not_negative)
-    outlet: float = option(10.0, "sphere diameters", "diameter of the orifice: the small one")
-    half_angle: float = option(45.0, "degrees", "of the cone, from the vertical")
-    filling: float = option(0.8, "silo diameters", "height of the settled bed if it were all in the cylinder")
-    perturbation: float = option(0.00016, "m", "greatest displacement of a sphere from its lattice point, per axis")
+    n: int = option(13, "radius of the silo in diameters of a sphere; 25 there")
+    radius: float = option(0.002, "radius of the spheres", unit="m")
+    friction: float = option(0.3, "friction coefficient between spheres: of M1", check=not_negative)
+    wall_friction: float = option(0.2, "friction coefficient of steel", check=not_negative)
+    bounce: float = option(0.5, "restitution between spheres: of M1", check=not_negative)
+    wall_bounce: float = option(0.4, "restitution of steel", check=not_negative)
+    outlet: float = option(10.0, "diameter of the orifice: the small one", unit="sphere diameters")
+    half_angle: float = option(45.0, "of the cone, from the vertical", unit="degrees")
+    filling: float = option(0.8, "height of the settled bed if it were all in the cylinder", unit="silo diameters")
+    perturbation: float = option(
+        0.00016, "greatest displacement of a sphere from its lattice point, per axis", unit="m"
+    )
     dt = 0.001
     delta = 0.0004
 

@@ -20,13 +20,13 @@ SMALLEST = 0.8  # of them; equal spheres between plane walls make a crystal, who
 class Heap(Experiment):
     """Spheres on a shelf between two frictionless walls; a lip holds the lowest layer."""
 
-    friction: float = option(0.5, "", "friction coefficient between spheres, and of shelf and lip")
-    rolling: float = option(0.0, "", "resistance to rolling between spheres, over the radius of the greatest")
-    columns: int = option(11, "", "spheres of the lattice along the shelf")
-    rows: int = option(4, "", "across")
-    layers: int = option(22, "", "above each other")
-    seed: int = option(1, "", "seed of the places and of the radii")
-    gate_speed: float = option(0.1, "m/s", "of the gate, upwards")
+    friction: float = option(0.5, "friction coefficient between spheres, and of shelf and lip")
+    rolling: float = option(0.0, "resistance to rolling between spheres, over the radius of the greatest")
+    columns: int = option(11, "spheres of the lattice along the shelf")
+    rows: int = option(4, "across")
+    layers: int = option(22, "above each other")
+    seed: int = option(1, "seed of the places and of the radii")
+    gate_speed: float = option(0.1, "of the gate, upwards", unit="m/s")
     dt = 0.005
     delta = 0.001
     settling_time = 0.6

@@ -23,12 +23,12 @@ class Intrusion(Experiment):
     """Spheres of 8 to 10 mm in a box without friction. The plate is a disc; a shaft without friction keeps the hole
     behind it open."""
 
-    friction: float = option(0.5, "", "friction coefficient between spheres, and of floor and plate")
-    width: int = option(18, "sphere diameters", "width of the box", positive)
-    layers: int = option(18, "", "layers of the lattice of the start")
-    plate: float = option(3.0, "sphere diameters", "radius of the plate", positive)
-    speed: float = option(0.05, "m/s", "of the plate, downwards", positive)
-    seed: int = option(1, "", "seed of the places and of the radii")
+    friction: float = option(0.5, "friction coefficient between spheres, and of floor and plate")
+    width: int = option(18, "width of the box", unit="sphere diameters", check=positive)
+    layers: int = option(18, "layers of the lattice of the start")
+    plate: float = option(3.0, "radius of the plate", unit="sphere diameters", check=positive)
+    speed: float = option(0.05, "of the plate, downwards", unit="m/s", check=positive)
+    seed: int = option(1, "seed of the places and of the radii")
     dt = 0.005
     delta = 0.001
     settling_time = 0.7

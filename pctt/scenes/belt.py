@@ -23,12 +23,12 @@ class Belt(Experiment):
     begins to turn, and rolls from the speed 2 v / 7 on. The sum of the forces on the belt is what drives it.
     """
 
-    n: int = option(3, "", "number of blocks, and of spheres", between(1))
-    speed: float = option(0.5, "m/s", "speed of the belt", finite)
-    friction: float = option(0.25, "", "friction coefficient of all contacts", positive)
-    radius: float = option(0.05, "m", "radius of the spheres, half the side of the blocks", positive)
-    density: float = option(2500.0, "kg/m^3", "density of both", positive)
-    gravity: float = option(9.81, "m/s^2", "gravity, downwards", positive)
+    n: int = option(3, "number of blocks, and of spheres", check=between(1))
+    speed: float = option(0.5, "speed of the belt", unit="m/s", check=finite)
+    friction: float = option(0.25, "friction coefficient of all contacts", check=positive)
+    radius: float = option(0.05, "radius of the spheres, half the side of the blocks", unit="m", check=positive)
+    density: float = option(2500.0, "density of both", unit="kg/m^3", check=positive)
+    gravity: float = option(9.81, "gravity, downwards", unit="m/s^2", check=positive)
 
     @property
     def length(self) -> float:

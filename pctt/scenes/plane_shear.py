@@ -32,18 +32,22 @@ class PlaneShear(Experiment):
     inertial number is that of disks, rate times sqrt(m / (P d)) with the mass m of the mean sphere.
     """
 
-    n: int = option(8, "", "width of the cell in diameters along x, y and, at the start, z; spheres of a layer along x",
-                    between(6))  # fmt: skip
-    layer: bool = option(False, "", "one layer of spheres, which move in the plane of flow and gradient")
-    inertial: float = option(0.1, "", "inertial number: rate times d sqrt(rho / P)", positive)
-    pressure: float = option(1000.0, "Pa", "normal stress along the gradient; of a layer the force on a length over d",
-                             positive)  # fmt: skip
-    radius: float = option(0.005, "m", "mean radius of the spheres", positive)
-    spread: float = option(0.2, "", "radii are uniform within this part of the mean", between(0.0, 0.5))
-    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)", positive)
-    friction: float = option(0.5, "", "friction coefficient of all contacts", not_negative)
-    fraction: float = option(0.55, "", "solid fraction at the start; a layer starts as a lattice", between(0.1, 0.58))
-    seed: int = option(1, "", "seed of the places and radii", not_negative)
+    n: int = option(
+        8,
+        "width of the cell in diameters along x, y and, at the start, z; spheres of a layer along x",
+        check=between(6)
+    )  # fmt: skip
+    layer: bool = option(False, "one layer of spheres, which move in the plane of flow and gradient")
+    inertial: float = option(0.1, "inertial number: rate times d sqrt(rho / P)", check=positive)
+    pressure: float = option(
+        1000.0, "normal stress along the gradient; of a layer the force on a length over d", unit="Pa", check=positive
+    )
+    radius: float = option(0.005, "mean radius of the spheres", unit="m", check=positive)
+    spread: float = option(0.2, "radii are uniform within this part of the mean", check=between(0.0, 0.5))
+    density: float = option(2500.0, "density of the spheres (glass)", unit="kg/m^3", check=positive)
+    friction: float = option(0.5, "friction coefficient of all contacts", check=not_negative)
+    fraction: float = option(0.55, "solid fraction at the start; a layer starts as a lattice", check=between(0.1, 0.58))
+    seed: int = option(1, "seed of the places and radii", check=not_negative)
 
     LAYERS: ClassVar[float] = 6.0  #: thickness of the cell of a layer, in diameters
 

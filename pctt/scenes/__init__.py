@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dem.experiment import Experiment
-from dem.scenes.belt import Belt
-from dem.scenes.blade import Blade
-from dem.scenes.drum import Drum
-from dem.scenes.incline import Incline
-from dem.scenes.mixer import Mixer
-from dem.scenes.plane_shear import PlaneShear
-from dem.scenes.shear import Shear
-from dem.scenes.silo import Silo
-from dem.scenes.triaxial import Triaxial
-from dem.scenes.wheel import Wheel
+from pctt.scenes.belt import Belt
+from pctt.scenes.blade import Blade
+from pctt.scenes.drum import Drum
+from pctt.scenes.incline import Incline
+from pctt.scenes.mixer import Mixer
+from pctt.scenes.plane_shear import PlaneShear
+from pctt.scenes.shear import Shear
+from pctt.scenes.silo import Silo
+from pctt.scenes.triaxial import Triaxial
+from pctt.scenes.wheel import Wheel
 
 SCENES: dict[str, type[Experiment]] = {
     "mixer": Mixer,

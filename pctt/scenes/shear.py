@@ -15,9 +15,9 @@ from dem.experiment import option
 from dem.motion import Guided
 from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import ToAndFro
 from dem.shapes import Box, Plane, Shape
 from dem.step import Step
+from pctt.scenes.lattice import ToAndFro
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,15 @@ class Shear(ToAndFro):
     move vertically, and lies on the spheres by its weight.
     """
 
-    n: int = option(4, "", "size: there are (3n+1)(2n+1)^2 spheres", between(1))
-    friction: float = option(0.25, "", "friction coefficient between spheres", not_negative)
-    wall_friction: float = option(0.25, "", "friction coefficient of spheres on walls, floor and press", not_negative)
-    press_density: float = option(10.0, "densities of the spheres", "density of the press", positive)
-    press_thickness: float = option(0.05, "box widths", "thickness of the press", positive)
-    split: float = option(0.5, "bed depths", "height of the plane between the halves; packing fraction 0.6", positive)
-    stroke: float = option(0.1, "box lengths", "greatest displacement of the lower half", positive)
+    n: int = option(4, "size: there are (3n+1)(2n+1)^2 spheres", check=between(1))
+    friction: float = option(0.25, "friction coefficient between spheres", check=not_negative)
+    wall_friction: float = option(0.25, "friction coefficient of spheres on walls, floor and press", check=not_negative)
+    press_density: float = option(10.0, "density of the press", unit="densities of the spheres", check=positive)
+    press_thickness: float = option(0.05, "thickness of the press", unit="box widths", check=positive)
+    split: float = option(
+        0.5, "height of the plane between the halves; packing fraction 0.6", unit="bed depths", check=positive
+    )
+    stroke: float = option(0.1, "greatest displacement of the lower half", unit="box lengths", check=positive)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -25,15 +25,15 @@ from dem.shapes import Plane, Shape
 class Spheres(Experiment):
     """Options of all scenes: spheres that start on a perturbed lattice. A scene has the method `positions`."""
 
-    n: int = option(4, "", "size: there are (2n+1)^3 spheres", between(1))
-    radius: float = option(0.1, "m", "radius of the spheres", positive)
-    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)", positive)
-    friction: float = option(0.25, "", "friction coefficient of all contacts", not_negative)
+    n: int = option(4, "size: there are (2n+1)^3 spheres", check=between(1))
+    radius: float = option(0.1, "radius of the spheres", unit="m", check=positive)
+    density: float = option(2500.0, "density of the spheres (glass)", unit="kg/m^3", check=positive)
+    friction: float = option(0.25, "friction coefficient of all contacts", check=not_negative)
     perturbation: float = option(
-        0.02, "m", "greatest displacement of a sphere from its lattice point, per axis", not_negative
+        0.02, "greatest displacement of a sphere from its lattice point, per axis", unit="m", check=not_negative
     )
-    seed: int = option(1, "", "seed of the perturbation", not_negative)
-    gravity: float = option(9.81, "m/s^2", "gravity, downwards", positive)
+    seed: int = option(1, "seed of the perturbation", check=not_negative)
+    gravity: float = option(9.81, "gravity, downwards", unit="m/s^2", check=positive)
 
     pitch: ClassVar[Any]  #: spacing of the lattice [m]
 
@@ -71,7 +71,7 @@ class Spheres(Experiment):
 class LargeSpheres(Spheres):
     """A scene whose lattice has a spacing of its own."""
 
-    pitch: float = option(0.25, "m", "spacing of the lattice on which the spheres start", positive)  # type: ignore[misc]
+    pitch: float = option(0.25, "spacing of the lattice on which the spheres start", unit="m", check=positive)  # type: ignore[misc]
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,10 @@ class ToAndFro(LargeSpheres):
     Its velocity is v = pi travel / period * sin(2 pi t / period), with t since the end of settling.
     """
 
-    period: float = option(4.0, "s", "period of the velocity of the body that moves: half of it is one way", positive)
-    cutoff: float = option(2.0, "Hz", "cutoff frequency of the low-pass filter of the forces", positive)
+    period: float = option(
+        4.0, "period of the velocity of the body that moves: half of it is one way", unit="s", check=positive
+    )
+    cutoff: float = option(2.0, "cutoff frequency of the low-pass filter of the forces", unit="Hz", check=positive)
 
     travel: ClassVar[Any]  #: way of the body from one end to the other [m]
 
@@ -106,13 +108,13 @@ class ToAndFro(LargeSpheres):
 class SmallSpheres(Spheres):
     """Lengths of scenes whose container is round, with a radius of n sphere diameters."""
 
-    n: int = option(6, "", "size: radius of the container in diameters of a sphere", between(3))
-    friction: float = option(0.5, "", "friction coefficient of all contacts", not_negative)
-    radius: float = option(0.005, "m", "radius of the greatest spheres", positive)
+    n: int = option(6, "size: radius of the container in diameters of a sphere", check=between(3))
+    friction: float = option(0.5, "friction coefficient of all contacts", check=not_negative)
+    radius: float = option(0.005, "radius of the greatest spheres", unit="m", check=positive)
     perturbation: float = option(
-        0.0004, "m", "greatest displacement of a sphere from its lattice point, per axis", not_negative
+        0.0004, "greatest displacement of a sphere from its lattice point, per axis", unit="m", check=not_negative
     )
-    sides: int = option(32, "", "flat sides of the container", between(12))
+    sides: int = option(32, "flat sides of the container", check=between(12))
 
     packing: ClassVar[float] = 0.58  #: share of the volume that settled spheres take
 

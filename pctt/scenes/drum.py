@@ -16,8 +16,8 @@ from dem.mesh import Mesh
 from dem.motion import Rotation
 from dem.packing import uniform
 from dem.scene import Scene
-from dem.scenes.lattice import SmallSpheres, rest_after_fall
 from dem.step import Step
+from pctt.scenes.lattice import SmallSpheres, rest_after_fall
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,17 @@ class Drum(SmallSpheres):
     so that a short drum stands for a piece of a long one.
     """
 
-    n: int = option(8, "", "size: radius of the drum in diameters of a sphere", between(3))
-    length: float = option(6.0, "sphere diameters", "length of the drum", between(2))
-    fill: float = option(0.3, "", "part of the drum that the settled bed fills, at most about a third", positive)
+    n: int = option(8, "size: radius of the drum in diameters of a sphere", check=between(3))
+    length: float = option(6.0, "length of the drum", unit="sphere diameters", check=between(2))
+    fill: float = option(0.3, "part of the drum that the settled bed fills, at most about a third", check=positive)
     spread: float = option(
-        0.2, "", "part by which the smallest spheres are smaller; equal ones order themselves", between(0, 0.9)
+        0.2, "part by which the smallest spheres are smaller; equal ones order themselves", check=between(0, 0.9)
     )
-    friction: float = option(0.5, "", "friction coefficient between spheres", not_negative)
-    wall_friction: float = option(0.9, "", "friction coefficient on the side of the drum", not_negative)
-    end_friction: float = option(0.0, "", "friction coefficient on the ends of the drum", not_negative)
-    froude: float = option(0.01, "", "speed: Froude number omega^2 R / g", positive)
-    sides: int = option(48, "", "flat sides of the drum", between(12))
+    friction: float = option(0.5, "friction coefficient between spheres", check=not_negative)
+    wall_friction: float = option(0.9, "friction coefficient on the side of the drum", check=not_negative)
+    end_friction: float = option(0.0, "friction coefficient on the ends of the drum", check=not_negative)
+    froude: float = option(0.01, "speed: Froude number omega^2 R / g", check=positive)
+    sides: int = option(48, "flat sides of the drum", check=between(12))
 
     def __post_init__(self) -> None:
         super().__post_init__()

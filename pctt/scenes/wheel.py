@@ -17,9 +17,9 @@ from dem.motion import Held
 from dem.packing import perturbed
 from dem.quaternion import exponential
 from dem.scene import Scene
-from dem.scenes.lattice import Spheres, rest_after_fall
 from dem.shapes import Box, Shape
 from dem.step import Step
+from pctt.scenes.lattice import Spheres, rest_after_fall
 
 
 @dataclass(frozen=True)
@@ -33,23 +33,23 @@ class Wheel(Spheres):
     "General scaling relations for locomotion in granular media", Phys. Rev. E 95, 052901 (2017)).
     """
 
-    n: int = option(6, "", "size: radius of the wheel in diameters of a sphere", between(3))
-    radius: float = option(0.005, "m", "radius of the spheres", positive)
-    friction: float = option(0.5, "", "friction coefficient between spheres, and of the wheel", not_negative)
+    n: int = option(6, "size: radius of the wheel in diameters of a sphere", check=between(3))
+    radius: float = option(0.005, "radius of the spheres", unit="m", check=positive)
+    friction: float = option(0.5, "friction coefficient between spheres, and of the wheel", check=not_negative)
     perturbation: float = option(
-        0.0004, "m", "greatest displacement of a sphere from its lattice point, per axis", not_negative
+        0.0004, "greatest displacement of a sphere from its lattice point, per axis", unit="m", check=not_negative
     )
-    width: float = option(5.0, "sphere diameters", "width of the bin", between(2))
-    depth: float = option(1.2, "wheel radii", "depth of the bed", positive)
-    way: float = option(2.0, "wheel radii", "way of the wheel for which the bin has room", positive)
-    froude: float = option(0.05, "", "spin of the wheel: Froude number omega^2 R / g", positive)
-    slip: float = option(0.3, "", "slip 1 - v / (omega R) of a carriage that is driven")
-    free: bool = option(False, "", "the carriage moves freely, against the drawbar load")
-    drawbar: float = option(0.0, "wheel weights", "load that pulls a free carriage backwards", finite)
-    weight: float = option(0.25, "", "weight of the wheel, over that of spheres in its circle", positive)
-    bars: int = option(6, "", "number of bars through the axle", between(2))
-    thickness: float = option(0.2, "wheel radii", "thickness of the bars", between(0.01, 1.0))
-    file: str = option("", "", "STL file of a wheel with its axle along y through the origin, in its radii")
+    width: float = option(5.0, "width of the bin", unit="sphere diameters", check=between(2))
+    depth: float = option(1.2, "depth of the bed", unit="wheel radii", check=positive)
+    way: float = option(2.0, "way of the wheel for which the bin has room", unit="wheel radii", check=positive)
+    froude: float = option(0.05, "spin of the wheel: Froude number omega^2 R / g", check=positive)
+    slip: float = option(0.3, "slip 1 - v / (omega R) of a carriage that is driven")
+    free: bool = option(False, "the carriage moves freely, against the drawbar load")
+    drawbar: float = option(0.0, "load that pulls a free carriage backwards", unit="wheel weights", check=finite)
+    weight: float = option(0.25, "weight of the wheel, over that of spheres in its circle", check=positive)
+    bars: int = option(6, "number of bars through the axle", check=between(2))
+    thickness: float = option(0.2, "thickness of the bars", unit="wheel radii", check=between(0.01, 1.0))
+    file: str = option("", "STL file of a wheel with its axle along y through the origin, in its radii")
 
     packing = 0.6  #: share of the volume that settled spheres take
 

@@ -29,15 +29,15 @@ class Incline(Experiment):
     (2001) 051302, whose bottom is a layer of a packing instead.
     """
 
-    n: int = option(8, "", "number of layers of spheres", between(1))
-    length: int = option(8, "", "length of the cell in spheres of the bottom", between(6))
-    width: int = option(6, "", "width of the cell in spheres of the bottom", between(6))
-    angle: float = option(24.0, "deg", "angle of the incline", between(0.0, 90.0))
-    radius: float = option(0.005, "m", "radius of the spheres", positive)
-    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)", positive)
-    friction: float = option(0.5, "", "friction coefficient of all contacts", not_negative)
-    gravity: float = option(9.81, "m/s^2", "gravity", positive)
-    seed: int = option(1, "", "seed of the displacements", not_negative)
+    n: int = option(8, "number of layers of spheres", check=between(1))
+    length: int = option(8, "length of the cell in spheres of the bottom", check=between(6))
+    width: int = option(6, "width of the cell in spheres of the bottom", check=between(6))
+    angle: float = option(24.0, "angle of the incline", unit="deg", check=between(0.0, 90.0))
+    radius: float = option(0.005, "radius of the spheres", unit="m", check=positive)
+    density: float = option(2500.0, "density of the spheres (glass)", unit="kg/m^3", check=positive)
+    friction: float = option(0.5, "friction coefficient of all contacts", check=not_negative)
+    gravity: float = option(9.81, "gravity", unit="m/s^2", check=positive)
+    seed: int = option(1, "seed of the displacements", check=not_negative)
 
     pitch: ClassVar[float] = 2.2  #: of the lattice on which the spheres start, in radii
 

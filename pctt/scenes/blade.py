@@ -13,9 +13,9 @@ from dem.checks import not_negative, positive
 from dem.experiment import option
 from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import ToAndFro
 from dem.shapes import Box
 from dem.step import Step
+from pctt.scenes.lattice import ToAndFro
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,11 @@ class Blade(ToAndFro):
     given in box widths keep the experiment similar for all n.
     """
 
-    margin: float = option(0.0, "m", "width of the box beyond (2n+1) pitch", not_negative)
-    thickness: float = option(0.1, "m", "thickness of the blade", positive)
-    blade_height: float = option(0.3, "box widths", "height of the blade", positive)
-    clearance: float = option(0.3, "box widths", "gap between the floor and the blade")
-    end_gap: float = option(0.3, "box widths", "gap between the blade and the end walls where it turns")
+    margin: float = option(0.0, "width of the box beyond (2n+1) pitch", unit="m", check=not_negative)
+    thickness: float = option(0.1, "thickness of the blade", unit="m", check=positive)
+    blade_height: float = option(0.3, "height of the blade", unit="box widths", check=positive)
+    clearance: float = option(0.3, "gap between the floor and the blade", unit="box widths")
+    end_gap: float = option(0.3, "gap between the blade and the end walls where it turns", unit="box widths")
 
     def __post_init__(self) -> None:
         super().__post_init__()

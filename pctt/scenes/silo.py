@@ -14,9 +14,9 @@ from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Glide
 from dem.scene import Scene
-from dem.scenes.lattice import SmallSpheres, rest_after_fall
 from dem.shapes import Plane
 from dem.step import Step
+from pctt.scenes.lattice import SmallSpheres, rest_after_fall
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,14 @@ class Silo(SmallSpheres):
     Cylinder and cone are one mesh, of flat sides. The mass below the outlet is recorded; its slope is the flow.
     """
 
-    filling: float = option(1.5, "silo diameters", "height of the settled bed if it were all in the cylinder", positive)
-    outlet: float = option(5.0, "sphere diameters", "diameter of the outlet", positive)
-    half_angle: float = option(30.0, "degrees", "of the cone, from the vertical; 90: flat bottom", between(5, 90))
-    drop: float = option(1.0, "silo diameters", "height of the outlet above the floor", positive)
+    filling: float = option(
+        1.5, "height of the settled bed if it were all in the cylinder", unit="silo diameters", check=positive
+    )
+    outlet: float = option(5.0, "diameter of the outlet", unit="sphere diameters", check=positive)
+    half_angle: float = option(
+        30.0, "of the cone, from the vertical; 90: flat bottom", unit="degrees", check=between(5, 90)
+    )
+    drop: float = option(1.0, "height of the outlet above the floor", unit="silo diameters", check=positive)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -30,18 +30,22 @@ class Triaxial(Experiment):
     At large strain its volume and stress no longer change: the critical state, whatever the density at the start.
     """
 
-    n: int = option(8, "", "width of the cell in diameters along x and y at the start", between(6))
-    height: float = option(1.5, "", "its height at the start, over its width", between(1.0))
-    pressure: float = option(1000.0, "Pa", "stress of the isotropic compression, and along x and y", positive)
-    strain_rate: float = option(0.1, "1/s", "rate of the logarithmic strain along z", positive)
-    start: float = option(0.5, "s", "time of the isotropic compression", not_negative)
-    plane: bool = option(False, "", "plane strain, a biaxial test: the width along y stays")
-    radius: float = option(0.005, "m", "mean radius of the spheres", positive)
-    spread: float = option(0.2, "", "radii are uniform within this part of the mean", between(0.0, 0.5))
-    density: float = option(2500.0, "kg/m^3", "density of the spheres (glass)", positive)
-    friction: float = option(0.5, "", "friction coefficient of all contacts", not_negative)
-    fraction: float = option(0.6, "", "solid fraction at the start; with less the sample is loose", between(0.1, 0.62))
-    seed: int = option(1, "", "seed of the places and radii", not_negative)
+    n: int = option(8, "width of the cell in diameters along x and y at the start", check=between(6))
+    height: float = option(1.5, "its height at the start, over its width", check=between(1.0))
+    pressure: float = option(
+        1000.0, "stress of the isotropic compression, and along x and y", unit="Pa", check=positive
+    )
+    strain_rate: float = option(0.1, "rate of the logarithmic strain along z", unit="1/s", check=positive)
+    start: float = option(0.5, "time of the isotropic compression", unit="s", check=not_negative)
+    plane: bool = option(False, "plane strain, a biaxial test: the width along y stays")
+    radius: float = option(0.005, "mean radius of the spheres", unit="m", check=positive)
+    spread: float = option(0.2, "radii are uniform within this part of the mean", check=between(0.0, 0.5))
+    density: float = option(2500.0, "density of the spheres (glass)", unit="kg/m^3", check=positive)
+    friction: float = option(0.5, "friction coefficient of all contacts", check=not_negative)
+    fraction: float = option(
+        0.6, "solid fraction at the start; with less the sample is loose", check=between(0.1, 0.62)
+    )
+    seed: int = option(1, "seed of the places and radii", check=not_negative)
 
     PEAK: ClassVar[float] = 0.01  #: the strain over which the stresses of a peak are averaged
 

@@ -15,8 +15,8 @@ from dem.experiment import option
 from dem.motion import Hinged, Rotation
 from dem.packing import perturbed
 from dem.scene import Scene
-from dem.scenes.lattice import LargeSpheres
 from dem.shapes import Box
+from pctt.scenes.lattice import LargeSpheres
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,16 @@ class Mixer(LargeSpheres):
     are those of the mixer benchmark of Chrono.
     """
 
-    margin: float = option(0.0, "m", "width of the box beyond (2n+1) pitch", not_negative)
-    paddle_length: float = option(1 / 2, "box widths", "length of the paddle", positive)
-    paddle_height: float = option(1 / 4, "box widths", "height of the paddle", positive)
-    paddle_thickness: float = option(1 / 20, "box widths", "thickness of the paddle", positive)
-    clearance: float = option(0.05, "m", "gap between the floor and the paddle", not_negative)
-    angular_velocity: float = option(pi / 3, "rad/s", "angular velocity of the paddle about the vertical")
+    margin: float = option(0.0, "width of the box beyond (2n+1) pitch", unit="m", check=not_negative)
+    paddle_length: float = option(1 / 2, "length of the paddle", unit="box widths", check=positive)
+    paddle_height: float = option(1 / 4, "height of the paddle", unit="box widths", check=positive)
+    paddle_thickness: float = option(1 / 20, "thickness of the paddle", unit="box widths", check=positive)
+    clearance: float = option(0.05, "gap between the floor and the paddle", unit="m", check=not_negative)
+    angular_velocity: float = option(pi / 3, "angular velocity of the paddle about the vertical", unit="rad/s")
     torque: float = option(
-        inf, "N m", "greatest torque of a drive that turns the paddle at that speed; inf: it is prescribed",
-        positive_or_inf,
+        inf,
+        "greatest torque of a drive that turns the paddle at that speed; inf: it is prescribed",
+        unit="N m", check=positive_or_inf
     )  # fmt: skip
 
     def __post_init__(self) -> None:

@@ -1,0 +1,32 @@
+"""Shapes of grains that a scene describes: what clumps, polyhedra and others have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from dem.arrays import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """A shape of grains that a scene describes, of density 1 in the frame with its origin at the centre of mass and the
+    principal axes. There is one for all grains that are alike."""
+
+    volume: float  #: [m^3]
+    moments: Floats  #: (3,) principal moments over the density [m^5]
+    place: Floats  #: (3,) the origin in the frame in which it was given [m]
+    turn: Floats  #: (4,) the axes in it
+    BASE: ClassVar[int]  #: the kind of the form of number n is BASE + n, see `dem.bodies`
+    SCALES: ClassVar[bool]  #: whether each grain has a scale of its own
+
+    @property
+    def size(self) -> Floats:
+        """(3,) radii of the sphere about the origin that encloses it, of the ball of its volume, and of the largest
+        sphere in it, as of `dem.bodies.Bodies` [m]."""
+        raise NotImplementedError
+
+    def described(self) -> dict[str, Any]:
+        """Its surface as files have it: `centres` (k, 3) and `radii` (k,) of spheres [m], or `vertices` (v, 3) [m] and
+        `triangles` (t, 3), rows of these."""
+        raise NotImplementedError
