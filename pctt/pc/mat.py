@@ -79,7 +79,8 @@ def iterations_with_the_diagonal(A: PETSc.Mat, scale: Array, most: int = 500) ->
 
 
 def conjugate_gradients(
-    A: PETSc.Mat, b: Array, solve: Callable[[Array], Array] | None = None, each: float = 0.0, x: Array | None = None
+    A: PETSc.Mat, b: Array, solve: Callable[[Array], Array] | None = None, each: float = 0.0, x: Array | None = None,
+    sign: float = 1.0,
 ) -> ConjugateGradients:  # fmt: skip
     """The method for A, step by step, with this rank's parts of all vectors; the norms are the same on all ranks."""
     comm, (vec, image) = A.comm.tompi4py(), A.createVecs()
@@ -92,7 +93,7 @@ def conjugate_gradients(
     def dot(p: Array, q: Array) -> float:
         return float(comm.bcast(comm.allreduce(float(np.dot(p, q)))))
 
-    return ConjugateGradients(times, b, solve, each, dot, x)
+    return ConjugateGradients(times, b, solve, each, dot, x, sign)
 
 
 def null_vectors(A: PETSc.Mat, P: PETSc.Mat) -> list[Array]:

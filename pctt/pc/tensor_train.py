@@ -263,7 +263,7 @@ class TensorTrain(Context):
         promise = None if self.P is None or self.failed else self.made.promise
         self._watch = None
         if promise is not None and Watch.can(ksp, pc):
-            self._watch = Watch(ksp, b, x, promise, self._trials)
+            self._watch = Watch(ksp, b, x, promise, self._trials, self.sign)
             self._trials = 0.0
 
     @staticmethod

@@ -24,13 +24,14 @@ class Watch:
     right side show; a preconditioner that has cost PATIENCE times what its trial has shown waits for neither. Costs are
     counted, not measured, and all ranks decide by the same norms.
 
+    sign : -1 where the matrix is negative definite
     spent : what trials for this solve have cost, in products
     solution : this rank's part; None as long as the KSP goes on
     products : of conjugate gradients alone so far
     """
 
-    def __init__(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec, promise: Promise, spent: float) -> None:
-        self.ksp, self.promise = ksp, promise
+    def __init__(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec, promise: Promise, spent: float, sign: float) -> None:
+        self.ksp, self.promise, self._sign = ksp, promise, sign
         self.solution: Array | None = None
         self._most = ksp.max_it
         self._b, self._start = b, x.array_r.copy() if ksp.getInitialGuessNonzero() else None
@@ -57,7 +58,8 @@ class Watch:
         if self._spent <= self._expected or self.solution is not None:
             return
         if self._alone is None:
-            self._alone = conjugate_gradients(self.ksp.getOperators()[0], self._b.array_r, x=self._start)
+            A = self.ksp.getOperators()[0]
+            self._alone = conjugate_gradients(A, self._b.array_r, x=self._start, sign=self._sign)
             self._go_on(PROBE)
             self._patience = min(self._patience, iterations(self._alone.norms, self._digits))
         if self._spent > self._patience:

@@ -23,6 +23,7 @@ class ConjugateGradients:
     solve : the product with the preconditioner; None: there is none
     each : the cost of this product, that of a product with the matrix is 1
     dot : the inner product, over all ranks
+    sign : -1 for a negative definite matrix, which has the same iterates
 
     x : the solution so far
     norms : of the residuals, one more than there were steps
@@ -37,8 +38,9 @@ class ConjugateGradients:
 
     def __init__(
         self, times: Product, b: Array, solve: Product | None = None, each: float = 0.0,
-        dot: Callable[[Array, Array], float] = np.dot, x: Array | None = None,
+        dot: Callable[[Array, Array], float] = np.dot, x: Array | None = None, sign: float = 1.0,
     ) -> None:  # fmt: skip
+        self.sign = sign
         self.times, self.solve, self.dot, self.each = times, solve, dot, each
         self.x = np.zeros_like(b) if x is None else x.copy()
         self._r = b.copy() if x is None else b - times(x)
@@ -65,7 +67,7 @@ class ConjugateGradients:
         self._p = z + self._rz / old * self._p
         q = self.times(self._p)
         curvature = float(self.dot(self._p, q))
-        if not (self._rz > 0 and 0 < curvature < inf):
+        if not (self._rz > 0 and 0 < self.sign * curvature < inf):
             self.failed = True
             return
         step = self._rz / curvature
