@@ -94,6 +94,7 @@ class ConeProblem:
         self.r, self.mu, self._given_r = contacts.r, contacts.mu, contacts.given_r
         self.cones = FrictionCones(self.mu) if cones is None else cones
         self.comm, self.key = comm, key
+        self._curvature: list[float] = []  # shared with problems of other r
         self.point = None if point is None else np.concatenate([point] * self.cones.parts)
         self.compliance = np.zeros(self.r.shape)
         self.compliance[: self.cones.count] = compliances(compliance, self.cones.count)
@@ -256,17 +257,21 @@ class ConeProblem:
         key = np.zeros(0) if self.key is None else self.key
         return (key, *self.operator.structure(), np.array([self.size]))
 
-    @cached_property
+    @property
     def lowest_curvature(self) -> float:
         """The least d'Nd / d'd that some Lanczos steps find for impulses d, over the greatest; 0 where N is positive
-        semidefinite by its making. Rounded digits of N make it negative too: -1e-5 with five. Collective."""
+        semidefinite by its making. Rounded digits of N make it negative too: -1e-5 with five. It is found once for all
+        r. Collective."""
         if self.contact_map is not None:
             return 0.0
+        if self._curvature:
+            return self._curvature[0]
         free = np.ones_like(self.r)
         free[self.cones.first_tangents == 0.0, 1:] = 0.0  # what has no friction has no tangential impulses
         start = free * np.random.default_rng(self.comm.rank).standard_normal(self.r.shape)
         values = ritz_values(lambda d: free * self.product(d), start, self.sum)
-        return min(values[0] / max(abs(values[0]), abs(values[-1]), TINY), 0.0)
+        self._curvature.append(min(values[0] / max(abs(values[0]), abs(values[-1]), TINY), 0.0))
+        return self._curvature[0]
 
     @cached_property
     def all_yield(self) -> bool:

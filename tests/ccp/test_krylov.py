@@ -192,18 +192,3 @@ def test_without_memory_a_failing_ksp_has_no_fallback(database, monkeypatch):
     assert np.array_equal(solved(newton, np.ones((40, 3)), 1e-8), np.zeros((40, 3)))
     assert newton.linear.fallbacks == 1
     newton.destroy()
-
-
-class Halving:
-    """A preconditioner of the user."""
-
-    def apply(self, pc, x, y):
-        x.copy(y)
-        y.scale(0.5)
-
-
-def test_a_python_preconditioner_of_the_user_is_named_by_its_class(database):
-    database["ccp_pc_type"], database["ccp_pc_python_type"] = "python", f"{__name__}.Halving"
-    solver = Krylov(SELF)
-    assert solver.words() == f"BiCGStab (right), {__name__}.Halving"
-    solver.destroy()

@@ -251,5 +251,19 @@ def test_no_solver_converges_silently_where_N_is_indefinite(solver, given):
         assert ccp.solve(smooth, type=solver, law=ccp.RELAXATION).converged
 
 
+def test_the_curvature_is_looked_for_once_for_all_load_steps():
+    products = []
+    dense = np.diag(np.arange(1.0, 31.0))
+    mult = ccp.Operator(lambda g: products.append(0) or (dense @ g.ravel()).reshape(-1, 3), np.array(diagonal(dense)))
+    problem = ccp.ConeProblem(SELF, np.tile([-1.0, 0.2, 0.0], (10, 1)), np.full(10, 0.4), N=mult)
+    counts = []
+    for load in (1.0, 1.5, 2.0):
+        products.clear()
+        assert ccp.solve(problem.with_velocities(load * problem.r), None, "apgd", law=ccp.RELAXATION).converged
+        counts.append(len(products))
+    assert counts[0] >= counts[1] + 10
+    assert counts[1] == counts[2]
+
+
 def diagonal(N):
     return [N[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] for c in range(len(N) // 3)]

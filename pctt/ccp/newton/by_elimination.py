@@ -44,7 +44,6 @@ class ByElimination:
 
     takes_unsymmetric = True
     readers: Sequence[str] = ()
-    remark = ""
 
     def __init__(self, comm: MPI.Comm, room: Room):
         self.ksp = ByKSP(comm, room, GIVEN)
@@ -79,6 +78,10 @@ class ByElimination:
     @property
     def systems(self) -> int:
         return self.ksp.systems
+
+    @property
+    def remark(self) -> str:
+        return self.ksp.remark
 
     def words(self) -> str:
         """How systems are solved."""
