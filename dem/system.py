@@ -28,10 +28,9 @@ from dem.cohesion import along_normal, attraction
 from dem.compiled import loop
 from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
-from dem.contact_map.cell import CellMap
-from dem.contact_map.jointed import JointedMap
 from dem.contact_map.loops import closing, scale
-from dem.contact_map.map import packed
+from dem.contact_map.mass import CellMass, JointedMass
+from dem.contact_map.rows import packed
 from dem.drives import Drives, free_directions
 from dem.free_motion import kept_spin
 from dem.joints import Coupling
@@ -61,7 +60,7 @@ class ContactSystem:
         spring; 0: rigid [1/kg]
         last (nc,), held (nc, 2): the normal impulses of the last step, and what tangential springs hold at the start of
         this one, from `take_hold` [N s]
-        cell: its part in the step, a `dem.contact_map.cell.Cell`; None where its size is constant
+        cell: its part in the step, a `dem.contact_map.mass.Cell`; None where its size is constant
         drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
         last step, in a cell that deforms [m/s]
         surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.surface`; None if there is none
@@ -138,8 +137,8 @@ class ContactSystem:
             freely, more = closing(rows.frame, arm, row, free)
             rounding += more
             own = here < owned
-            coupling = self.joints.matrix
-            self.contact_map = JointedMap(self.contact_map, here[own], slot[own], coupling)
+            jointed = JointedMass(world.comm, root, here[own], slot[own], self.joints.matrix)
+            self.contact_map = self.contact_map.with_mass(jointed)
         self.free_velocity = free[:owned]
         self.free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
@@ -151,8 +150,9 @@ class ContactSystem:
         self.take_flow(world, contacts)
         self.cell = cell_of(world, contacts, self.frame, dt)
         if self.cell is not None:
-            self.contact_map = CellMap(self.contact_map, self.cell)
-            self.contact_map.add_rates(self.cell.free, freely)
+            mass = CellMass(world.comm, root, self.cell)
+            self.contact_map = self.contact_map.with_mass(mass)
+            mass.add_flow(self.cell.free, freely)
         if contacts.drift is not None:
             freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
         self._attracted: Floats | float = 0.0  #: mass-scaled momenta of the attraction
@@ -160,17 +160,10 @@ class ContactSystem:
             self._attracted = momentum = self.contact_map.momenta(along_normal(-self.attraction))
             self.free_velocity = self.velocity_with(momentum)
             freely += self.contact_map.velocities(momentum)
-        known = self.contact_map.free if isinstance(self.contact_map, CellMap) else self.contact_map
-        self.resistance = resistance(world, contacts, known, self.frame, free)
-        self.problem_map: ContactMap = self.contact_map
-        if self.resistance is not None:
-            self.problem_map = self.resistance.map
-            if isinstance(self.contact_map, JointedMap):
-                self.problem_map = self.contact_map.of(self.resistance.map)
-            if self.cell is not None:
-                self.problem_map = CellMap(self.resistance.map, self.cell)
-            if self.attraction is not None:
-                self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
+        self.resistance = resistance(world, contacts, self.contact_map, self.frame, free)
+        self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
+        if self.resistance is not None and self.attraction is not None:
+            self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
         self.at_once, self._freely = 0, freely
         self._bounces, self._part = np.zeros(len(contacts), np.bool_), np.ones(len(contacts))
         if world.pairs.restitution.any():
@@ -258,10 +251,8 @@ class ContactSystem:
 
     def velocity_with(self, momentum: Floats) -> Floats:
         """Velocities (owned, 6) after the step for the mass-scaled momenta G' g (owned, 6), in any shape."""
-        change, momentum = np.empty_like(self.free_velocity), momentum.reshape(-1, 6)[: len(self.free_velocity)]
-        if isinstance(self.contact_map, JointedMap):
-            momentum = self.contact_map.coupled(momentum)
-        scale(self.contact_map.given.root, momentum, change)
+        change = np.empty_like(self.free_velocity)
+        self.contact_map.mass.scale(momentum.reshape(-1, 6), change)
         return self.free_velocity + change
 
     def kept(self, world: World, velocity: Floats) -> Floats:
@@ -279,9 +270,10 @@ class ContactSystem:
     def set_rate(self, world: World, momentum: Floats) -> None:
         """Give a cell that deforms the rate of its periods in this step, for the momenta of `velocity_with`;
         collective."""
-        if isinstance(self.contact_map, CellMap) and world.servo is not None:
-            rate = self.contact_map.rate_of(momentum.reshape(-1, 6) + self._attracted)
-            world.servo = replace(world.servo, rate=self.contact_map.cell.free + rate)
+        mass = self.contact_map.mass
+        if isinstance(mass, CellMass) and world.servo is not None:
+            rate = mass.rate_of(momentum.reshape(-1, 6) + self._attracted)
+            world.servo = replace(world.servo, rate=mass.cell.free + rate)
 
     def take_flow(self, world: World, contacts: Contacts) -> None:
         """Take the drift of the contacts from the shear and the rate of the cell."""
@@ -320,9 +312,7 @@ class ContactSystem:
 
     def _push(self, impulse: Floats, moment: Floats | None) -> Floats:
         """What contacts alone give the jointed bodies (n, 6), mass-scaled."""
-        known = self.problem_map
-        assert isinstance(known, JointedMap)
-        return known.gathered(known.free.momenta(impulse if moment is None else np.concatenate([impulse, moment])))
+        return self.problem_map.shared(impulse if moment is None else np.concatenate([impulse, moment]))
 
     def drive_impulse(self, large: Floats) -> Floats:
         """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities
