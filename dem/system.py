@@ -22,7 +22,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies, stiffness
-from dem.arrays import Floats, Ints, Keys, places
+from dem.arrays import Floats, Keys, places
 from dem.bodies import Bodies
 from dem.cohesion import along_normal, attraction
 from dem.compiled import loop
@@ -33,11 +33,17 @@ from dem.contact_map.mass import CellMass, JointedMass
 from dem.contact_map.rows import packed
 from dem.drives import Drives, free_directions
 from dem.free_motion import kept_spin
-from dem.joints import Coupling
 from dem.rolling import resistance
 from dem.servo import cell_of
 from dem.surface import surface_velocities
-from dem.unconstrained import UnconstrainedMotion, free_velocities, joint_coupling, joints_refound, slots
+from dem.unconstrained import (
+    UnconstrainedMotion,
+    free_velocities,
+    joint_coupling,
+    joints_refound,
+    large_velocity,
+    slots,
+)
 from dem.world import World, turns_unlike_spheres
 
 #: Bodies that contacts turned by more radians in the last step were struck: those impulses do not come again.
@@ -51,7 +57,7 @@ class ContactSystem:
 
     Attributes, of nc local contacts and of the bodies whose rows this rank owns (`World.owned`):
         dt (float): step [s]
-        motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`
+        motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`, with the `push` and the joints of the step
         contacts: as the search found them
         key (nc,), mu (nc,), point (nc, 3): contact key, friction coefficient, contact point [m]
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
@@ -59,7 +65,7 @@ class ContactSystem:
         compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
         spring; 0: rigid [1/kg]
         last (nc,), held (nc, 2): the normal impulses of the last step, and what tangential springs hold at the start of
-        this one, from `take_hold` [N s]
+        this one [N s]
         cell: its part in the step, a `dem.contact_map.mass.Cell`; None where its size is constant
         drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
         last step, in a cell that deforms [m/s]
@@ -71,7 +77,6 @@ class ContactSystem:
         problem_map: G of the cone problem: with the rows of turning, where contacts resist it
         free_velocity (owned, 6): velocities without contacts, but with their attraction
         free_large (large, 6): the same of the large bodies, without attraction, on all ranks
-        push (owned, 6): mass-scaled momenta that contacts are expected to give; None if all bodies turn as spheres do
         middle (owned, 3): the angular velocities about which those of the step are linear in the impulses, see
         `dem.free_motion.free_spin`, or None
         resistance: the rows of `dem.rolling`, or None
@@ -84,18 +89,17 @@ class ContactSystem:
 
     def __init__(
         self, world: World, contacts: Contacts, motion: UnconstrainedMotion, recovery_speed: float = np.inf,
-        joints: Coupling | None = None, expected: Floats | None = None, push: Floats | None = None,
-        eased: tuple[Keys, Floats] | None = None,
+        last: Floats | None = None, eased: tuple[Keys, Floats] | None = None,
     ) -> None:  # fmt: skip
-        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `joints`: those
-        of this step, if contacts have shown them. `expected`:
-        impulses (nc, 3) that the contacts are expected to have, as those of the last step; or `push` if it is known.
-        `eased`: contacts that bounce with a part of e alone, by key, from the method of that name."""
+        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart. `last`: what
+        the memory of the last step has of these contacts (parts nc, 3): the impulses that they are expected to have,
+        and with which springs begin. `eased`: contacts that bounce with a part of e alone, by key, from the method of
+        that name."""
         dt = motion.dt
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
         near, owned = contacts.near, world.owned
-        self.dt, self.motion, self.contacts, self.near = dt, motion, contacts, near
+        self.dt, self.contacts, self.near = dt, contacts, near
         self.key, self.mu, self.point = contacts.key, contacts.friction, contacts.point
         self.frame = contact_frames(contacts.normal)
         moves = bodies.is_dynamic(near.bodies)
@@ -111,22 +115,22 @@ class ContactSystem:
         halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
         self.contact_map = ContactMap(world.comm, rows, halo, row)
         self.attraction = attraction(world, contacts, dt)
-        self.push = push
-        if self.push is None and turns_unlike_spheres(world):
-            impulse = np.zeros((len(contacts), 3)) if expected is None else expected[: len(contacts)]
-            self.push = self.contact_map.momenta(self.net(impulse))
-        change = None
-        if self.push is not None:
-            change = np.empty_like(self.push)
-            scale(self.contact_map.given.root, self.push, change)
+        last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
+        change, push = None, motion.push
+        if push is None and turns_unlike_spheres(world):
+            push = self.contact_map.momenta(self.net(last))
+        if push is not None:
+            change = np.empty_like(push)
+            scale(self.contact_map.given.root, push, change)
             struck = dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
-            self.push[struck], change[struck] = 0.0, 0.0
+            push[struck], change[struck] = 0.0, 0.0
         free, self.middle = free_velocities(world, near, motion, change)
         self.applied = motion.applied
         if self.applied is not None or change is not None:
             halo.update(free)
         freely, rounding = closing(rows.frame, arm, row, free)
-        self.joints = joint_coupling(world, motion, self.push) if joints is None else joints
+        self.joints = joint_coupling(world, motion, push) if motion.joints is None else motion.joints
+        self.motion = replace(motion, push=push, joints=self.joints)
         if self.joints is not None:
             here, slot = slots(world, near.bodies.id)
             spin = self.joints.spin[slot]
@@ -143,7 +147,7 @@ class ContactSystem:
         self.free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
         self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
-        self.last, self.held = np.zeros(len(contacts)), np.zeros((len(contacts), 2))
+        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
         self.surface = surface_velocities(world, contacts, self.frame)
         if self.surface is not None:
             self.b[:, 1:] = self.surface
@@ -172,6 +176,7 @@ class ContactSystem:
             strikes = np.isfinite(contacts.parting)
             self.b[strikes, 0], self.compliance[strikes] = -contacts.parting[strikes], 0.0
         self.r = _beyond(self.b, freely, rounding)
+        stiffness.pull_back(self.r, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
 
@@ -199,11 +204,13 @@ class ContactSystem:
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 
-    def eased(self, impulse: Floats, momentum: Floats) -> tuple[Keys, Floats] | None:
+    def eased(self, world: World, impulse: Floats, momentum: Floats) -> tuple[Keys, Floats] | None:
         """Contacts that are to bounce less, by key, and with which part of e: the next one for those whose impulses do
         work, where all contacts together, with these impulses (parts nc, 3) and momenta, make energy. Newton's law of
         impacts may do so with friction (Kane and Levinson 1985), and does not at e = 0. None if they make none, or if
         no part is left; collective."""
+        if not world.pairs.restitution.any():
+            return None
         parts = 1 if self.resistance is None else 2
         g = impulse.reshape(parts, len(self.key), 3)
         change = self.problem_map.velocities(momentum.reshape(-1, 6)).reshape(g.shape)
@@ -217,12 +224,6 @@ class ContactSystem:
         self._part[less] = PARTS[np.searchsorted(PARTS, self._part[less]) - 1]
         eased = self._part < 1.0
         return self.key[eased], self._part[eased]
-
-    def take_hold(self, last: Floats) -> None:
-        """Let springs begin with what they held at the end of the last step (nc, 3), as `held_after` gave it, in the
-        frames of this one [N s]."""
-        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
-        stiffness.pull_back(self.r, self.compliance, self.held)
 
     def held_after(self, impulse: Floats) -> Floats:
         """Impulses of the step (parts nc, 3), see `dem.pairs.Pairs.parts`, with what tangential springs hold at its end
@@ -245,6 +246,12 @@ class ContactSystem:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
         return impulse if self.attraction is None else impulse - along_normal(self.attraction)
 
+    def parts(self, impulse: Floats) -> tuple[Floats, Floats | None]:
+        """What contacts do to bodies (nc, 3), and their moments (nc, 3) where they resist rolling, for the impulses
+        (parts nc, 3) of the cone problem [N s]."""
+        count = len(self.key)
+        return self.net(impulse[:count]), None if self.resistance is None else impulse[count:]
+
     def velocity(self, impulse: Floats) -> Floats:
         """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""
         return self.velocity_with(self.contact_map.momenta(impulse))
@@ -255,11 +262,11 @@ class ContactSystem:
         self.contact_map.mass.scale(momentum.reshape(-1, 6), change)
         return self.free_velocity + change
 
-    def kept(self, world: World, velocity: Floats) -> Floats:
+    def kept(self, velocity: Floats) -> Floats | None:
         """The velocities (owned, 6) with which bodies go into the next step, where those of this one are `velocity`:
-        the same but of bodies that are no spheres, see `dem.free_motion.kept_spin`."""
+        others of bodies that are no spheres, see `dem.free_motion.kept_spin`; None: the same."""
         if self.middle is None:
-            return velocity
+            return None
         own = self.near.bodies.take(slice(len(velocity)))
         out = velocity.copy()
         rows = np.flatnonzero(np.isfinite(self.middle[:, 0]))
@@ -299,16 +306,20 @@ class ContactSystem:
             return np.zeros(0)
         return self.joints.impulses(self._push(impulse, moment))
 
-    def spent_with(self, large: Floats) -> Ints | None:
-        """`Drives.refound` for the velocities (large, 6) of large bodies after the step."""
-        return self.drives.refound(self.drive_impulse(large), large)
-
-    def joints_with(self, world: World, impulse: Floats, moment: Floats | None = None) -> Coupling | None:
-        """The joints of the step if these impulses and moments of contacts (nc, 3) show that other limits and motors
-        hold, else None; collective."""
-        if self.joints is None or not self.joints.decides:
+    def refound(self, world: World, impulse: Floats, velocity: Floats) -> UnconstrainedMotion | None:
+        """The motion with other joints and drives, where the impulses (parts nc, 3) of the cone problem and the
+        velocities (owned, 6) show that other limits and motors hold, or that drives are too weak; else None.
+        Collective."""
+        known, joints, spent = self.motion, None, None
+        if self.joints is not None and self.joints.decides:
+            joints = joints_refound(world, self.joints, self._push(*self.parts(impulse)))
+        if self.drives.most.any():
+            large = large_velocity(world, known, velocity)
+            spent = self.drives.refound(self.drive_impulse(large), large)
+        if joints is None and spent is None:
             return None
-        return joints_refound(world, self.joints, self._push(impulse, moment))
+        known = known if joints is None else replace(known, joints=joints)
+        return known if spent is None else known.with_spent(world, spent)
 
     def _push(self, impulse: Floats, moment: Floats | None) -> Floats:
         """What contacts alone give the jointed bodies (n, 6), mass-scaled."""

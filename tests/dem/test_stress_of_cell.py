@@ -137,7 +137,7 @@ def test_products_with_the_map_of_a_cell_are_those_of_a_matrix(turning):
     comm = MPI.COMM_WORLD
     sim = packed(comm, rolling=5e-4 * turning, spinning=1e-4 * turning)
     sim.run(steps=2)
-    system, random = sim.stepper.system, np.random.default_rng(comm.rank)
+    system, random = sim.last.system, np.random.default_rng(comm.rank)
     cell = system.cell._replace(root=np.array([2.0, 0.0, 3.0]))
     root, count = system.contact_map.given.root, len(cell.lever)
     free, G = (system.problem_map.with_mass(mass) for mass in (InverseMass(root), CellMass(comm, root, cell)))

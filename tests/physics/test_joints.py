@@ -395,8 +395,8 @@ def test_rows_of_the_map_are_those_of_its_products(rolling):
         scene.add_joint(f"joint {k}", *ends, kind="hinge", anchor=grid[other] + [0.05, 0.1, 0], axis=(0, 1, k))
     sim = pctt.Simulation(scene, comm=comm, dt=0.005, say=lambda text: None)
     sim.step()
-    G, random = sim.stepper.system.problem_map, np.random.default_rng(comm.rank)
-    assert comm.allreduce(len(sim.stepper.system.key)) > 30
+    G, random = sim.last.system.problem_map, np.random.default_rng(comm.rank)
+    assert comm.allreduce(len(sim.last.system.key)) > 30
     rows = BlockMap(comm, G.block_rows)
     v, g = random.normal(size=(G.columns, 6)), random.normal(size=(G.rows, 3))
     np.testing.assert_allclose(rows.velocities(v), G.velocities(v), atol=1e-12)
