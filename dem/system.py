@@ -230,18 +230,6 @@ class ContactSystem:
         in the place of the tangential ones [N s]."""
         return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
 
-    def spring_energies(
-        self, contacts: Contacts, before: Floats, opening: Floats, impulse: Floats
-    ) -> tuple[float, float, float, float]:
-        """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3) in the friction cones, and the normal
-        velocities `opening` (nc,) of its end; `before` (rows, 6) are the velocities before it."""
-        came = self.contact_map.relative_velocities(before)[:, 0]
-        if self.drift is not None:
-            came = came + self.drift[:, 0]
-        gaps = contacts.gap - self.dt * came, contacts.gap, contacts.linear_gap + self.dt * opening
-        held = self.last, self.held, impulse
-        return stiffness.spring_energies(self.stiffness, self.compliance, self.dt, *gaps, *held)
-
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
         return impulse if self.attraction is None else impulse - along_normal(self.attraction)
@@ -330,25 +318,6 @@ class ContactSystem:
         `large` (large, 6) after the step."""
         line, slip = self.drives.line, self.free_large - large
         return self.drives.impulse + (self.drives.grip * np.einsum("bi,bi->b", line, slip))[:, None] * line
-
-    def works(
-        self, impulse: Floats, before: Floats, grains: Floats, large: Floats, moment: Floats | None = None
-    ) -> tuple[float, float, Floats]:
-        """The work of this rank's normal impulses, and of its tangential ones and moments (nc, 3), on the mean of two
-        velocities [J], and the normal velocities (nc,) of the second ones: `before` (rows, 6) are of all rows of
-        `near`, the second of the local grains (grains, 6) and of the large bodies (large, 6); collective."""
-        after = np.zeros_like(before)
-        after[: self.near.grains] = grains
-        self.contact_map.halo.update(after)
-        after[self.near.grains + self.near.ghosts :] = large
-        normal, tangential, opening = self.contact_map.works(impulse, before, after)
-        if self.drift is not None:
-            normal, opening = normal + float(impulse[:, 0] @ self.drift[:, 0]), opening + self.drift[:, 0]
-            tangential += float(np.vdot(impulse[:, 1:], self.drift[:, 1:]))
-        if moment is not None and self.resistance is not None:
-            turning = self.resistance.map.turning
-            tangential += 0.5 * float(np.vdot(moment, turning(before) + turning(after)))
-        return normal, tangential, opening
 
 
 def gap_velocities(
