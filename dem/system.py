@@ -95,54 +95,18 @@ class ContactSystem:
         the memory of the last step has of these contacts (parts nc, 3): the impulses that they are expected to have,
         and with which springs begin. `eased`: contacts that bounce with a part of e alone, by key, from the method of
         that name."""
-        dt = motion.dt
+        dt, near, owned = motion.dt, contacts.near, world.owned
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
-        near, owned = contacts.near, world.owned
-        self.dt, self.contacts, self.near = dt, contacts, near
+        self.dt, self.contacts, self.near, self.drives, self.applied = dt, contacts, near, motion.drives, motion.applied
         self.key, self.mu, self.point = contacts.key, contacts.friction, contacts.point
         self.frame = contact_frames(contacts.normal)
-        moves = bodies.is_dynamic(near.bodies)
-        # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
-        row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
-        arm = contact_arms(contacts, near.bodies.position, row)
-        self.drives = motion.drives
-        root = inverse_root_masses(world, self.drives)
-        rows = CompactRows(self.frame.reshape(-1, 9), arm, body, root, owned)
-        ghosts = np.flatnonzero(touched)
-        index = near.index[ghosts]
-        owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
-        halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
-        self.contact_map = ContactMap(world.comm, rows, halo, row)
+        self.contact_map = _map_of(world, contacts, self.frame, self.drives)
         self.attraction = attraction(world, contacts, dt)
         last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
-        change, push = None, motion.push
-        if push is None and turns_unlike_spheres(world):
-            push = self.contact_map.momenta(self.net(last))
-        if push is not None:
-            change = np.empty_like(push)
-            scale(self.contact_map.given.root, push, change)
-            struck = dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
-            push[struck], change[struck] = 0.0, 0.0
-        free, self.middle = free_velocities(world, near, motion, change)
-        self.applied = motion.applied
-        if self.applied is not None or change is not None:
-            halo.update(free)
-        freely, rounding = closing(rows.frame, arm, row, free)
-        self.joints = joint_coupling(world, motion, push) if motion.joints is None else motion.joints
-        self.motion = replace(motion, push=push, joints=self.joints)
-        if self.joints is not None:
-            here, slot = slots(world, near.bodies.id)
-            spin = self.joints.spin[slot]
-            free[here, 3:] = np.where(np.isnan(spin), free[here, 3:], spin)
-            free[here] += self.joints.change[slot]
-            if self.middle is not None:
-                self.middle[here[here < owned]] = self.joints.middle[slot[here < owned]]
-            freely, more = closing(rows.frame, arm, row, free)
-            rounding += more
-            own = here < owned
-            jointed = JointedMass(world.comm, root, here[own], slot[own], self.joints.matrix)
-            self.contact_map = self.contact_map.with_mass(jointed)
+        self.motion, change = self._linearised(world, motion, last)
+        self.joints = self.motion.joints
+        free, freely, rounding = self._free(world, change)
         self.free_velocity = free[:owned]
         self.free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
@@ -154,7 +118,7 @@ class ContactSystem:
         self.take_flow(world, contacts)
         self.cell = cell_of(world, contacts, self.frame, dt)
         if self.cell is not None:
-            mass = CellMass(world.comm, root, self.cell)
+            mass = CellMass(world.comm, self.contact_map.given.root, self.cell)
             self.contact_map = self.contact_map.with_mass(mass)
             mass.add_flow(self.cell.free, freely)
         if contacts.drift is not None:
@@ -179,6 +143,45 @@ class ContactSystem:
         stiffness.pull_back(self.r, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
+
+    def _linearised(
+        self, world: World, motion: UnconstrainedMotion, last: Floats
+    ) -> tuple[UnconstrainedMotion, Floats | None]:
+        """The motion with the joints, and with the push about which it is linear where bodies turn in other ways than
+        spheres, if it has none yet: that of the `last` impulses (nc, 3); and what the push changes of the velocities
+        (owned, 6). Collective."""
+        change, push = None, motion.push
+        if push is None and turns_unlike_spheres(world):
+            push = self.contact_map.momenta(self.net(last))
+        if push is not None:
+            change = np.empty_like(push)
+            scale(self.contact_map.given.root, push, change)
+            struck = self.dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
+            push[struck], change[struck] = 0.0, 0.0
+        joints = joint_coupling(world, motion, push) if motion.joints is None else motion.joints
+        return replace(motion, push=push, joints=joints), change
+
+    def _free(self, world: World, change: Floats | None) -> tuple[Floats, Floats, Floats]:
+        """Velocities (rows, 6) without contacts of the bodies of `near`, with joints, those of the contacts (nc, 3) and
+        their rounding (nc,); collective. Sets `middle` and the inverse mass of jointed bodies."""
+        given, row, owned = self.contact_map.given, self.contact_map.body, world.owned
+        free, self.middle = free_velocities(world, self.near, self.motion, change)
+        if self.applied is not None or change is not None:
+            self.contact_map.halo.update(free)
+        freely, rounding = closing(given.frame, given.arm, row, free)
+        if self.joints is not None:
+            here, slot = slots(world, self.near.bodies.id)
+            spin = self.joints.spin[slot]
+            free[here, 3:] = np.where(np.isnan(spin), free[here, 3:], spin)
+            free[here] += self.joints.change[slot]
+            if self.middle is not None:
+                self.middle[here[here < owned]] = self.joints.middle[slot[here < owned]]
+            freely, more = closing(given.frame, given.arm, row, free)
+            rounding += more
+            own = here < owned
+            jointed = JointedMass(world.comm, given.root, here[own], slot[own], self.joints.matrix)
+            self.contact_map = self.contact_map.with_mass(jointed)
+        return free, freely, rounding
 
     def _bounce(
         self, world: World, contacts: Contacts, freely: Floats, eased: tuple[Keys, Floats] | None
@@ -318,6 +321,20 @@ class ContactSystem:
         `large` (large, 6) after the step."""
         line, slip = self.drives.line, self.free_large - large
         return self.drives.impulse + (self.drives.grip * np.einsum("bi,bi->b", line, slip))[:, None] * line
+
+
+def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> ContactMap:
+    """The map of contacts with these frames (nc, 3, 3), of bodies that nothing couples beside them; collective."""
+    near, owned, moves = contacts.near, world.owned, bodies.is_dynamic(contacts.near.bodies)
+    # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
+    row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
+    arm = contact_arms(contacts, near.bodies.position, row)
+    rows = CompactRows(frame.reshape(-1, 9), arm, body, inverse_root_masses(world, drives), owned)
+    ghosts = np.flatnonzero(touched)
+    index = near.index[ghosts]
+    owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
+    halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
+    return ContactMap(world.comm, rows, halo, row)
 
 
 def gap_velocities(
