@@ -28,9 +28,9 @@ class Applied:
     expected: Floats | None = None  #: (springs, 2, 6) velocities of the ends after the step, see `dem.springs.impulses`
 
 
-def applied_impulses(world: World, dt: float, prescribed: Floats) -> Applied | None:
-    """What loads and springs give in the next step of dt [s] with the `prescribed` (large, 6) velocities, None without
-    any; collective. SceneError if a law fails, or if dt is too large for the springs."""
+def applied_impulses(world: World, dt: float, given: Floats) -> Applied | None:
+    """What loads and springs give in the next step of dt [s] in which motions give the velocities `given` (large, 6);
+    None without any; collective. SceneError if a law fails, or if dt is too large for the springs."""
     if not (world.loads or world.springs):
         return None
     grains, large = np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity)
@@ -42,7 +42,7 @@ def applied_impulses(world: World, dt: float, prescribed: Floats) -> Applied | N
         call = partial(load.impulses, world.time, dt, table.take(rows))
         found = together(world.comm, f"load {name!r}", call)
         out[rows] += world.comm.bcast(found) if of_one else found  # processors may round in other ways
-    return _with_springs(world, grains, large, prescribed, dt)
+    return _with_springs(world, grains, large, given, dt)
 
 
 def _chosen(world: World, load: Load) -> Ints | Bools:
@@ -52,7 +52,7 @@ def _chosen(world: World, load: Load) -> Ints | Bools:
     return np.arange(len(world.grains)) if load.on is None else np.isin(world.grains.id, load.on)
 
 
-def _with_springs(world: World, grains: Floats, large: Floats, prescribed: Floats, dt: float) -> Applied:
+def _with_springs(world: World, grains: Floats, large: Floats, given: Floats, dt: float) -> Applied:
     """The impulses of loads and those of springs; collective."""
     if not world.springs:
         return Applied(grains, large, np.zeros((0, 3)))
@@ -61,7 +61,7 @@ def _with_springs(world: World, grains: Floats, large: Floats, prescribed: Float
     ids = np.unique([end for end in ends if isinstance(end, int)]).astype(np.int64)
     many, first = len(ids) + len(world.large), len(ids)
     row = np.array([row_of(world, ids, end) for end in ends]).reshape(-1, 2)
-    table = ends_of(world, ids, grains, large, prescribed, dt)
+    table = ends_of(world, ids, grains, large, given, dt)
     found = springs.impulses(members, row, table, world.expected, dt) if world.comm.rank == 0 else None
     g, change, expected, highest = world.comm.bcast(found)  # processors may round in other ways
     if dt * highest >= 2.0:
@@ -82,7 +82,7 @@ def row_of(world: World, ids: Ints, end: springs.End) -> int:
     return len(ids) + (len(world.large) if end is None else world.large_row(end))
 
 
-def ends_of(world: World, ids: Ints, grains: Floats, large: Floats, prescribed: Floats, dt: float) -> Ends:
+def ends_of(world: World, ids: Ints, grains: Floats, large: Floats, given: Floats, dt: float) -> Ends:
     """The grains of these ids, the large bodies and the world, with impulses (grains, 6) and (large, 6); collective."""
     here = np.flatnonzero(np.isin(world.grains.id, ids))
     own = world.grains.take(here)
@@ -94,7 +94,7 @@ def ends_of(world: World, ids: Ints, grains: Floats, large: Floats, prescribed: 
     gathered[np.searchsorted(ids, own.id)] = np.concatenate([*columns, own.inertia, change[:, 3:]], axis=1)
     world.comm.Allreduce(MPI.IN_PLACE, gathered)  # each row is that of one rank
     parts = np.split(gathered, np.cumsum([3, 4, 6, 6, 1, 9, 3]), axis=1)
-    position, turn, velocity, free, light, inverse_inertia, moments, given = parts
+    position, turn, velocity, free, light, inverse_inertia, moments, pushes = parts
     tools = world.large
     change = velocity_changes(tools, large)
     pushed = free_velocity(tools, world.gravity, dt) + change
@@ -107,8 +107,8 @@ def ends_of(world: World, ids: Ints, grains: Floats, large: Floats, prescribed: 
         np.concatenate([position, tools.position, np.zeros((1, 3))]),
         np.concatenate([turn, tools.quaternion, [[1.0, 0.0, 0.0, 0.0]]]),
         np.concatenate([velocity, tools.velocity, np.zeros((1, 6))]),
-        np.concatenate([free, as_motions_allow(world, pushed, prescribed, dt), np.zeros((1, 6))]),
+        np.concatenate([free, as_motions_allow(world, pushed, given), np.zeros((1, 6))]),
         inverse,
         np.concatenate([moments, tools.inertia, np.full((1, 3), np.inf)]),
-        np.concatenate([given, change[:, 3:], np.zeros((1, 3))]),
+        np.concatenate([pushes, change[:, 3:], np.zeros((1, 3))]),
     )

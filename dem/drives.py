@@ -10,8 +10,9 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.free_motion import free_velocity, velocity_changes
-from dem.motion import DROOP, Driven, Dynamic, Guided
+from dem.motion import DROOP, Driven, Dynamic, Guided, Pose, velocity_between
 from dem.scene import LargeBody
+from dem.together import together
 from dem.world import World
 
 
@@ -39,13 +40,13 @@ class Drives:
         return None if np.array_equal(spent, self.spent) else spent
 
 
-def drives_of(world: World, dt: float, prescribed: Floats, pushed: Floats | None, spent: Ints) -> Drives:
-    """The drives of the next step of dt [s], the same on all ranks; `prescribed` (large, 6): velocities of prescribed
-    motions, `pushed` (large, 6): impulses of loads and springs, None without any."""
+def drives_of(world: World, dt: float, given: Floats, pushed: Floats | None, spent: Ints) -> Drives:
+    """The drives of the next step of dt [s], the same on all ranks; `given` (large, 6): the velocities that motions
+    give, `pushed` (large, 6): impulses of loads and springs, None without any."""
     table, impulse = world.large, np.zeros_like(world.large.velocity)
     line, (grip, speed, most) = np.zeros_like(impulse), np.zeros((3, len(impulse)))
     if not bodies.is_dynamic(table).any():
-        return Drives(impulse, line, grip, speed, most, spent, prescribed)
+        return Drives(impulse, line, grip, speed, most, spent, given)
     free = falling = free_velocity(table, world.gravity, dt)
     if pushed is not None:
         impulse += pushed
@@ -63,17 +64,34 @@ def drives_of(world: World, dt: float, prescribed: Floats, pushed: Floats | None
             grip[row] = motion.grip(world.time, dt, inertia, float(world.large.velocity[row] @ line[row]), lack)
     if impulse.any():
         falling = falling + velocity_changes(table, impulse)
-    return Drives(impulse, line, grip, speed, most, spent, as_motions_allow(world, falling, prescribed, dt))
+    return Drives(impulse, line, grip, speed, most, spent, as_motions_allow(world, falling, given))
 
 
-def as_motions_allow(world: World, velocity: Floats, prescribed: Floats, dt: float) -> Floats:
-    """The velocities (large, 6), with what motions hold or prescribe over a step of dt [s]."""
-    free = prescribed.copy()
+def given_velocities(world: World, poses: dict[int, Pose], dt: float) -> Floats:
+    """The mean velocities (large, 6) over a step of dt [s] that motions give: to bodies that they prescribe those which
+    lead to the `poses`, to others what they hold, zero where these are free; collective. SceneError if a motion
+    fails."""
+    given = np.zeros_like(world.large.velocity)
+    for row, end in poses.items():
+        given[row] = velocity_between((world.large.position[row], world.large.quaternion[row]), end, dt)
+
+    def hold() -> None:
+        for row, body in enumerate(world.large_bodies):
+            if isinstance(motion := body.motion, Dynamic):
+                given[row] = motion.held(world.time, dt)
+
+    if len(poses) < len(given):
+        together(world.comm, "motion of a large body", hold)
+    return given
+
+
+def as_motions_allow(world: World, velocity: Floats, given: Floats) -> Floats:
+    """The velocities (large, 6) in the directions that motions leave free, and in the others those `given`."""
+    free = given.copy()
     for row, body in enumerate(world.large_bodies):
         if isinstance(motion := body.motion, Dynamic):
-            free[row, :3] = motion.free_directions() @ velocity[row, :3]
-            free[row, 3:] = motion.free_turns() @ velocity[row, 3:]
-            free[row] += motion.held(world.time, dt)
+            free[row, :3] += motion.free_directions() @ velocity[row, :3]
+            free[row, 3:] += motion.free_turns() @ velocity[row, 3:]
     return free
 
 

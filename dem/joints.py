@@ -7,7 +7,7 @@ A joint has rows J of the velocities of its two bodies. In a step with the free 
 with t for what the joint holds such that its error is gone at the end of the step, see `coupling`.
 Motors have t = their speed. Their e is 0 if nothing bounds them. A bounded one gives the impulse f which brings it to
 its speed without contacts, within its strength, and e as `dem.motion.Driven` has its grip. Contacts see the joints in
-their inverse mass (`dem.contact_map.jointed`), so joints and contacts are solved together. Which limits are reached and
+their inverse mass (`dem.contact_map.mass`), so joints and contacts are solved together. Which limits are reached and
 which motors are too weak is found without contacts first (`coupling`). Where the contacts of the step show another set,
 they are solved once more with it (`refound`).
 """
@@ -167,7 +167,7 @@ class Coupling:
     solver: Floats  #: (k, k) (B B' + e)^-1 of the rows that hold
     impulse: Floats  #: (k,) without contacts [N s, N m s]
     change: Floats  #: (n, 6) of velocities, by these impulses
-    matrix: Floats  #: (6 n, 6 n) K of `dem.contact_map.jointed`
+    matrix: Floats  #: (6 n, 6 n) K of `dem.contact_map.mass`
     spin: Floats  #: (n, 3) angular velocities without joints and contacts; NaN where all moments are equal, or infinite
     middle: Floats  #: (n, 3) about which they are linear in the impulses, see `dem.free_motion.free_spin`
 

@@ -6,13 +6,13 @@ All functions are collective, and their results are the same on all ranks and, t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies
+from dem import bodies, stiffness
 from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
@@ -172,61 +172,100 @@ def energy_balance(step: Step) -> dict[str, float]:
     world, near, comm, system = step.world, step.contacts.near, step.world.comm, step.system
     first, moves = near.grains + near.ghosts, bodies.is_dynamic(world.large)
     before = near.bodies.take(slice(0, near.grains)), near.bodies.take(slice(first, None))
-    after = world.grains, world.large
-
-    def sums(grains: Any, large: Any) -> Floats:
-        """Local sums; what all ranks know of the large bodies counts once."""
-        return np.array(grains) + (np.array(large) if comm.rank == 0 else 0.0)
-
-    was = sums(*(energy(table, world.gravity) for table in before))
-    now = sums(*(energy(table, world.gravity) for table in after))
+    after, own = (world.grains, world.large), 1 if comm.rank else 2  # the large bodies count once
+    was, now = (_each(energy(table, world.gravity) for table in tables[:own]) for tables in (before, after))
+    still, least = _each(_still(table, world.gravity, system.dt) for table in after[:own])
     velocity = near.bodies.velocity.copy()
     velocity[first:][~moves] = world.large.velocity[~moves]
     mean = 0.5 * (velocity[first:] + world.large.velocity)
-    speeds = [table.velocity for table in after]
-    normal, tangential, opening = system.works(step.in_cone, velocity, speeds[0], speeds[1], step.moment)
-    *springs, strained, strained_at_end = system.spring_energies(step.contacts, velocity, opening, step.in_cone)
-    received = np.vdot(step.impulse_on_large[~moves], mean[~moves])
-    loads = 0.0
+    normal, tangential, opening = works(step, step.in_cone, velocity, step.moment)
+    elastic, elastic_at_end, strained, strained_at_end = spring_energies(step, velocity, opening)
+    cohesion = 0.0 if system.attraction is None else works(step, step.impulse, velocity)[0] - normal
+    loads = belts = flow = 0.0
     if system.applied is not None:
-        loads = comm.allreduce(0.5 * np.vdot(system.applied.grains, before[0].velocity + world.grains.velocity))
-    belts = 0.0
+        loads = 0.5 * np.vdot(system.applied.grains, before[0].velocity + world.grains.velocity)
     if system.surface is not None:
-        belts = comm.allreduce(-np.vdot(step.impulse[:, 1:], system.surface))
+        belts = -np.vdot(step.impulse[:, 1:], system.surface)
     if system.drift is not None:
-        loads += comm.allreduce(-np.vdot(step.impulse, system.drift))
+        flow = -np.vdot(step.impulse, system.drift)
+    whole = _summed(
+        comm, kinetic_before=was[0], potential_before=was[1], kinetic=now[0], potential=now[1], normal=normal,
+        tangential=tangential, elastic=elastic, elastic_at_end=elastic_at_end, strained=strained,
+        strained_at_end=strained_at_end, still=still, least=least, carried=_carried(step, ~moves), cohesion=cohesion,
+        loads=loads, belts=belts, flow=flow,
+    )  # fmt: skip
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
     joints, joints_at_end = _joint_works(step, before[0].velocity, mean)
-    holding += joints
-    driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + loads + belts + holding
-    work = driving - received
-    still, least = sums(*(_still(table, world.gravity, system.dt) for table in after))
-    cohesion = 0.0
-    if system.attraction is not None:
-        cohesion = system.works(step.impulse, velocity, *speeds)[0] - normal
-    more = cohesion, strained, strained_at_end, least
-    whole = np.array([*was, *now, normal, tangential, *springs, still, _carried(step, ~moves), *more])
-    comm.Allreduce(MPI.IN_PLACE, whole)
-    change, held, strained = whole[2] + whole[3] - whole[0] - whole[1], whole[7] - whole[6], whole[12] - whole[11]
-    rise, fallen, released = whole[2] - whole[0], whole[1] - whole[3], max(-held, 0.0) + max(-strained, 0.0)
-    there = whole[0] + whole[8] + whole[9]
-    # with the velocity of the end, for bodies that were at rest
-    pulled = 2.0 * max(whole[10], 0.0) + max(joints_at_end - joints, 0.0)
-    created = rise - fallen - work - released - pulled > CREATED * (there + whole[6] + whole[11] + abs(work))
-    driven = max(fallen, 0.0) + max(driving, 0.0) + pulled + released * (whole[9] == 0.0)
-    jumps = rise > whole[13] and (created or whole[2] - driven > SUDDEN * there + CREATED * driven)
+    driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + (whole["loads"] + whole["flow"])
+    driving = driving + whole["belts"] + (holding + joints)
+    work = driving - np.vdot(step.impulse_on_large[~moves], mean[~moves])
+    rise, fallen = whole["kinetic"] - whole["kinetic_before"], whole["potential_before"] - whole["potential"]
+    held, bent = whole["elastic_at_end"] - whole["elastic"], whole["strained_at_end"] - whole["strained"]
+    pulled, released = 2.0 * max(whole["cohesion"], 0.0), max(-held, 0.0) + max(-bent, 0.0)
+    pulled += max(joints_at_end - joints, 0.0)  # with the velocity of the end, for bodies that were at rest
+    there = whole["kinetic_before"] + whole["still"] + whole["carried"]
+    stored = whole["elastic"] + whole["strained"]
+    created = rise - fallen - work - released - pulled > CREATED * (there + stored + abs(work))
+    driven = max(fallen, 0.0) + max(driving, 0.0) + pulled + released * (whole["carried"] == 0.0)
+    jumps = rise > whole["least"] and (created or whole["kinetic"] - driven > SUDDEN * there + CREATED * driven)
+    change = whole["kinetic"] + whole["potential"] - whole["kinetic_before"] - whole["potential_before"]
+    made = change - work - whole["normal"] - whole["tangential"] - whole["cohesion"] + whole["belts"]
     return {
-        "kinetic_energy [J]": whole[2],
-        "potential_energy [J]": whole[3],
-        "spring_energy_before [J]": whole[6] + whole[11],
-        "spring_energy [J]": whole[7] + whole[12],
+        "kinetic_energy [J]": whole["kinetic"],
+        "potential_energy [J]": whole["potential"],
+        "spring_energy_before [J]": stored,
+        "spring_energy [J]": whole["elastic_at_end"] + whole["strained_at_end"],
         "work_of_motions [J]": work,
-        "friction_loss [J]": belts - whole[5] - strained,  # nothing is zero, not -0
-        "impact_loss [J]": 0.0 - whole[4] - held,
-        **({} if system.attraction is None else {"work_of_cohesion [J]": whole[10]}),
-        "time_stepping [J]": change - work - whole[4] - whole[5] - whole[10] + belts,
+        "friction_loss [J]": whole["belts"] - whole["tangential"] - bent,  # nothing is zero, not -0
+        "impact_loss [J]": 0.0 - whole["normal"] - held,
+        **({} if system.attraction is None else {"work_of_cohesion [J]": whole["cohesion"]}),
+        "time_stepping [J]": made,
         "energy_jump [J]": comm.bcast(rise if jumps else 0.0),  # what follows from it must not differ between ranks
     }
+
+
+def _each(pairs: Iterable[tuple[float, float]]) -> tuple[float, float]:
+    """The sums of the first and of the second numbers of pairs."""
+    first, second = zip(*pairs)
+    return sum(first), sum(second)
+
+
+def _summed(comm: MPI.Comm, **numbers: float) -> dict[str, float]:
+    """Numbers by name, summed over the ranks; collective."""
+    return dict(zip(numbers, reduced(comm, [*numbers.values()], ())[0]))
+
+
+def works(
+    step: Step, impulse: Floats, before: Floats, moment: Floats | None = None
+) -> tuple[float, float, Floats]:
+    """The work of this rank's normal impulses, and of its tangential ones and moments (nc, 3), on the mean of the
+    velocities `before` (rows, 6), of all rows of `near`, and of those after the step [J]; and the normal velocities
+    (nc,) of the latter; collective."""
+    system, near = step.system, step.contacts.near
+    after = np.zeros_like(before)
+    after[: near.grains] = step.world.grains.velocity
+    system.contact_map.halo.update(after)
+    after[near.grains + near.ghosts :] = step.world.large.velocity
+    normal, tangential, opening = system.contact_map.works(impulse, before, after)
+    if system.drift is not None:
+        normal, opening = normal + float(impulse[:, 0] @ system.drift[:, 0]), opening + system.drift[:, 0]
+        tangential += float(np.vdot(impulse[:, 1:], system.drift[:, 1:]))
+    if moment is not None and system.resistance is not None:
+        turning = system.resistance.map.turning
+        tangential += 0.5 * float(np.vdot(moment, turning(before) + turning(after)))
+    return normal, tangential, opening
+
+
+def spring_energies(step: Step, before: Floats, opening: Floats) -> tuple[float, float, float, float]:
+    """`dem.stiffness.spring_energies` of a step, with the velocities `before` (rows, 6) and the normal velocities
+    `opening` (nc,) of its end."""
+    system, contacts = step.system, step.contacts
+    came = system.contact_map.relative_velocities(before)[:, 0]
+    if system.drift is not None:
+        came = came + system.drift[:, 0]
+    gaps = contacts.gap - system.dt * came, contacts.gap, contacts.linear_gap + system.dt * opening
+    held = system.last, system.held, step.in_cone
+    return stiffness.spring_energies(system.stiffness, system.compliance, system.dt, *gaps, *held)
 
 
 def _still(table: Bodies, gravity: Floats, dt: float) -> tuple[float, float]:

@@ -10,7 +10,7 @@ Along an axis of given stress the cell yields to what its stress lacks, as a pis
     E = E0 + (stress of the contacts + stress of the motion - asked) / eta,
 
 the law of the wall of da Cruz et al., Physical Review E 72 (2005) 021309, but for E0. Here E is an unknown of the step
-beside the velocities of the bodies (`dem.contact_map.cell`), with the stress of the contacts over that step. So any eta
+beside the velocities of the bodies (`dem.contact_map.mass`), with the stress of the contacts over that step. So any eta
 is stable, whatever dt and the stiffness of the contacts. A cell without contacts closes at asked / eta: CLOSING as an
 inertial number, and LEADING times the rates of shear and strain that it is given, as a flow dilates by some tenths of
 these. Where the cell has to go on at a rate E, its stress is off by eta (E - E0). So E0 is the
@@ -24,7 +24,7 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Floats
 from dem.contact import Contacts
-from dem.contact_map.cell import Cell
+from dem.contact_map.mass import Cell
 from dem.world import World
 
 CLOSING = 0.01  #: rate times d sqrt(rho / P): a loose cell closes in quasistatic motion

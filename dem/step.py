@@ -6,7 +6,6 @@ them apart, `find_overrun` and `find_turned` find the others.
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -167,8 +166,7 @@ def advance(
 
 def advanced(world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats) -> World:
     """The world that `advance` leads to; this one stays as it is. Collective."""
-    after = copy(world)
-    after.grains, after.large = replace(world.grains), replace(world.large)
+    after = world.trial()
     advance(after, free, contacts, velocity)
     return after
 

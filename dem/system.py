@@ -22,23 +22,28 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies, stiffness
-from dem.arrays import Floats, Ints, Keys, places
+from dem.arrays import Floats, Keys, places
 from dem.bodies import Bodies
 from dem.cohesion import along_normal, attraction
 from dem.compiled import loop
 from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
-from dem.contact_map.cell import CellMap
-from dem.contact_map.jointed import JointedMap
 from dem.contact_map.loops import closing, scale
-from dem.contact_map.map import packed
+from dem.contact_map.mass import CellMass, JointedMass
+from dem.contact_map.rows import packed
 from dem.drives import Drives, free_directions
 from dem.free_motion import kept_spin
-from dem.joints import Coupling
 from dem.rolling import resistance
 from dem.servo import cell_of
 from dem.surface import surface_velocities
-from dem.unconstrained import UnconstrainedMotion, free_velocities, joint_coupling, joints_refound, slots
+from dem.unconstrained import (
+    UnconstrainedMotion,
+    free_velocities,
+    joint_coupling,
+    joints_refound,
+    large_velocity,
+    slots,
+)
 from dem.world import World, turns_unlike_spheres
 
 #: Bodies that contacts turned by more radians in the last step were struck: those impulses do not come again.
@@ -52,7 +57,7 @@ class ContactSystem:
 
     Attributes, of nc local contacts and of the bodies whose rows this rank owns (`World.owned`):
         dt (float): step [s]
-        motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`
+        motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`, with the `push` and the joints of the step
         contacts: as the search found them
         key (nc,), mu (nc,), point (nc, 3): contact key, friction coefficient, contact point [m]
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
@@ -60,8 +65,8 @@ class ContactSystem:
         compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
         spring; 0: rigid [1/kg]
         last (nc,), held (nc, 2): the normal impulses of the last step, and what tangential springs hold at the start of
-        this one, from `take_hold` [N s]
-        cell: its part in the step, a `dem.contact_map.cell.Cell`; None where its size is constant
+        this one [N s]
+        cell: its part in the step, a `dem.contact_map.mass.Cell`; None where its size is constant
         drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
         last step, in a cell that deforms [m/s]
         surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.surface`; None if there is none
@@ -72,7 +77,6 @@ class ContactSystem:
         problem_map: G of the cone problem: with the rows of turning, where contacts resist it
         free_velocity (owned, 6): velocities without contacts, but with their attraction
         free_large (large, 6): the same of the large bodies, without attraction, on all ranks
-        push (owned, 6): mass-scaled momenta that contacts are expected to give; None if all bodies turn as spheres do
         middle (owned, 3): the angular velocities about which those of the step are linear in the impulses, see
         `dem.free_motion.free_spin`, or None
         resistance: the rows of `dem.rolling`, or None
@@ -85,75 +89,38 @@ class ContactSystem:
 
     def __init__(
         self, world: World, contacts: Contacts, motion: UnconstrainedMotion, recovery_speed: float = np.inf,
-        joints: Coupling | None = None, expected: Floats | None = None, push: Floats | None = None,
-        eased: tuple[Keys, Floats] | None = None, smooth: bool = False,
+        last: Floats | None = None, eased: tuple[Keys, Floats] | None = None, smooth: bool = False,
     ) -> None:  # fmt: skip
-        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart; `joints`: those
-        of this step, if contacts have shown them. `expected`:
-        impulses (nc, 3) that the contacts are expected to have, as those of the last step; or `push` if it is known.
-        `eased`: contacts that bounce with a part of e alone, by key, from the method of that name; `smooth`: without
-        friction."""
-        dt = motion.dt
+        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart. `last`: what
+        the memory of the last step has of these contacts (parts nc, 3): the impulses that they are expected to have,
+        and with which springs begin. `eased`: contacts that bounce with a part of e alone, by key, from the method of
+        that name; `smooth`: impacts without friction."""
+        dt, near, owned = motion.dt, contacts.near, world.owned
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
-        near, owned = contacts.near, world.owned
-        self.dt, self.motion, self.contacts, self.near = dt, motion, contacts, near
+        self.dt, self.contacts, self.near, self.drives, self.applied = dt, contacts, near, motion.drives, motion.applied
         self.key, self.mu, self.point = contacts.key, contacts.friction, contacts.point
         self.frame = contact_frames(contacts.normal)
-        moves = bodies.is_dynamic(near.bodies)
-        # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
-        row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
-        arm = contact_arms(contacts, near.bodies.position, row)
-        self.drives = motion.drives
-        root = inverse_root_masses(world, self.drives)
-        rows = CompactRows(self.frame.reshape(-1, 9), arm, body, root, owned)
-        ghosts = np.flatnonzero(touched)
-        index = near.index[ghosts]
-        owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
-        halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
-        self.contact_map = ContactMap(world.comm, rows, halo, row)
+        self.contact_map = _map_of(world, contacts, self.frame, self.drives)
         self.attraction = attraction(world, contacts, dt)
-        self.push = push
-        if self.push is None and turns_unlike_spheres(world):
-            impulse = np.zeros((len(contacts), 3)) if expected is None else expected[: len(contacts)]
-            self.push = self.contact_map.momenta(self.net(impulse))
-        change = None
-        if self.push is not None:
-            change = np.empty_like(self.push)
-            scale(self.contact_map.given.root, self.push, change)
-            struck = dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
-            self.push[struck], change[struck] = 0.0, 0.0
-        free, self.middle = free_velocities(world, near, motion, change)
-        self.applied = motion.applied
-        if self.applied is not None or change is not None:
-            halo.update(free)
-        freely, rounding = closing(rows.frame, arm, row, free)
-        self.joints = joint_coupling(world, motion, self.push) if joints is None else joints
-        if self.joints is not None:
-            here, slot = slots(world, near.bodies.id)
-            spin = self.joints.spin[slot]
-            free[here, 3:] = np.where(np.isnan(spin), free[here, 3:], spin)
-            free[here] += self.joints.change[slot]
-            if self.middle is not None:
-                self.middle[here[here < owned]] = self.joints.middle[slot[here < owned]]
-            freely, more = closing(rows.frame, arm, row, free)
-            rounding += more
-            own = here < owned
-            coupling = self.joints.matrix
-            self.contact_map = JointedMap(self.contact_map, here[own], slot[own], coupling)
+        last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
+        self.motion, change = self._linearised(world, motion, last)
+        self.joints = self.motion.joints
+        free, freely, rounding = self._free(world, change)
         self.free_velocity = free[:owned]
         self.free_large = free[near.grains + near.ghosts :]
         self.b = np.zeros((len(contacts), 3))
         self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
-        self.last, self.held = np.zeros(len(contacts)), np.zeros((len(contacts), 2))
+        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
         self.surface = surface_velocities(world, contacts, self.frame)
         if self.surface is not None:
             self.b[:, 1:] = self.surface
         self.take_flow(world, contacts)
         self.cell = cell_of(world, contacts, self.frame, dt)
         if self.cell is not None:
-            self.contact_map = CellMap(self.contact_map, self.cell)
-            self.contact_map.add_rates(self.cell.free, freely)
+            mass = CellMass(world.comm, self.contact_map.given.root, self.cell)
+            self.contact_map = self.contact_map.with_mass(mass)
+            mass.add_flow(self.cell.free, freely)
         if contacts.drift is not None:
             freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
         self._attracted: Floats | float = 0.0  #: mass-scaled momenta of the attraction
@@ -161,17 +128,10 @@ class ContactSystem:
             self._attracted = momentum = self.contact_map.momenta(along_normal(-self.attraction))
             self.free_velocity = self.velocity_with(momentum)
             freely += self.contact_map.velocities(momentum)
-        known = self.contact_map.free if isinstance(self.contact_map, CellMap) else self.contact_map
-        self.resistance = resistance(world, contacts, known, self.frame, free)
-        self.problem_map: ContactMap = self.contact_map
-        if self.resistance is not None:
-            self.problem_map = self.resistance.map
-            if isinstance(self.contact_map, JointedMap):
-                self.problem_map = self.contact_map.of(self.resistance.map)
-            if self.cell is not None:
-                self.problem_map = CellMap(self.resistance.map, self.cell)
-            if self.attraction is not None:
-                self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
+        self.resistance = resistance(world, contacts, self.contact_map, self.frame, free)
+        self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
+        if self.resistance is not None and self.attraction is not None:
+            self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
         self.at_once, self._freely = 0, freely
         self._bounces, self._part = np.zeros(len(contacts), np.bool_), np.ones(len(contacts))
         if world.pairs.restitution.any():
@@ -186,8 +146,48 @@ class ContactSystem:
         if contacts.swing is not None:  # impacts last no step
             self.b[:, 1:] += np.where(impacts[:, None], 0.0, np.einsum("cij,cj->ci", self.frame[:, 1:], contacts.swing))
         self.r = _beyond(self.b, freely, rounding)
+        stiffness.pull_back(self.r, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
+
+    def _linearised(
+        self, world: World, motion: UnconstrainedMotion, last: Floats
+    ) -> tuple[UnconstrainedMotion, Floats | None]:
+        """The motion with the joints, and with the push about which it is linear where bodies turn in other ways than
+        spheres, if it has none yet: that of the `last` impulses (nc, 3); and what the push changes of the velocities
+        (owned, 6). Collective."""
+        change, push = None, motion.push
+        if push is None and turns_unlike_spheres(world):
+            push = self.contact_map.momenta(self.net(last))
+        if push is not None:
+            change = np.empty_like(push)
+            scale(self.contact_map.given.root, push, change)
+            struck = self.dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
+            push[struck], change[struck] = 0.0, 0.0
+        joints = joint_coupling(world, motion, push) if motion.joints is None else motion.joints
+        return replace(motion, push=push, joints=joints), change
+
+    def _free(self, world: World, change: Floats | None) -> tuple[Floats, Floats, Floats]:
+        """Velocities (rows, 6) without contacts of the bodies of `near`, with joints, those of the contacts (nc, 3) and
+        their rounding (nc,); collective. Sets `middle` and the inverse mass of jointed bodies."""
+        given, row, owned = self.contact_map.given, self.contact_map.body, world.owned
+        free, self.middle = free_velocities(world, self.near, self.motion, change)
+        if self.applied is not None or change is not None:
+            self.contact_map.halo.update(free)
+        freely, rounding = closing(given.frame, given.arm, row, free)
+        if self.joints is not None:
+            here, slot = slots(world, self.near.bodies.id)
+            spin = self.joints.spin[slot]
+            free[here, 3:] = np.where(np.isnan(spin), free[here, 3:], spin)
+            free[here] += self.joints.change[slot]
+            if self.middle is not None:
+                self.middle[here[here < owned]] = self.joints.middle[slot[here < owned]]
+            freely, more = closing(given.frame, given.arm, row, free)
+            rounding += more
+            own = here < owned
+            jointed = JointedMass(world.comm, given.root, here[own], slot[own], self.joints.matrix)
+            self.contact_map = self.contact_map.with_mass(jointed)
+        return free, freely, rounding
 
     def _bounce(
         self, world: World, contacts: Contacts, freely: Floats, eased: tuple[Keys, Floats] | None
@@ -213,11 +213,13 @@ class ContactSystem:
         self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 
-    def eased(self, impulse: Floats, momentum: Floats) -> tuple[Keys, Floats] | None:
+    def eased(self, world: World, impulse: Floats, momentum: Floats) -> tuple[Keys, Floats] | None:
         """Contacts that are to bounce less, by key, and with which part of e: the next one for those whose impulses do
         work, where all contacts together, with these impulses (parts nc, 3) and momenta, make energy. Newton's law of
         impacts may do so with friction (Kane and Levinson 1985), and does not at e = 0. None if they make none, or if
         no part is left; collective."""
+        if not world.pairs.restitution.any():
+            return None
         parts = 1 if self.resistance is None else 2
         g = impulse.reshape(parts, len(self.key), 3)
         change = self.problem_map.velocities(momentum.reshape(-1, 6)).reshape(g.shape)
@@ -232,32 +234,20 @@ class ContactSystem:
         eased = self._part < 1.0
         return self.key[eased], self._part[eased]
 
-    def take_hold(self, last: Floats) -> None:
-        """Let springs begin with what they held at the end of the last step (nc, 3), as `held_after` gave it, in the
-        frames of this one [N s]."""
-        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
-        stiffness.pull_back(self.r, self.compliance, self.held)
-
     def held_after(self, impulse: Floats) -> Floats:
         """Impulses of the step (parts nc, 3), see `ContactLaw.parts`, with what tangential springs hold at its end
         in the place of the tangential ones [N s]."""
         return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
 
-    def spring_energies(
-        self, contacts: Contacts, before: Floats, opening: Floats, impulse: Floats
-    ) -> tuple[float, float, float, float]:
-        """`dem.stiffness.spring_energies` of the step with these impulses (nc, 3) in the friction cones, and the normal
-        velocities `opening` (nc,) of its end; `before` (rows, 6) are the velocities before it."""
-        came = self.contact_map.relative_velocities(before)[:, 0]
-        if self.drift is not None:
-            came = came + self.drift[:, 0]
-        gaps = contacts.gap - self.dt * came, contacts.gap, contacts.linear_gap + self.dt * opening
-        held = self.last, self.held, impulse
-        return stiffness.spring_energies(self.stiffness, self.compliance, self.dt, *gaps, *held)
-
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
         return impulse if self.attraction is None else impulse - along_normal(self.attraction)
+
+    def parts(self, impulse: Floats) -> tuple[Floats, Floats | None]:
+        """What contacts do to bodies (nc, 3), and their moments (nc, 3) where they resist rolling, for the impulses
+        (parts nc, 3) of the cone problem [N s]."""
+        count = len(self.key)
+        return self.net(impulse[:count]), None if self.resistance is None else impulse[count:]
 
     def velocity(self, impulse: Floats) -> Floats:
         """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""
@@ -265,17 +255,15 @@ class ContactSystem:
 
     def velocity_with(self, momentum: Floats) -> Floats:
         """Velocities (owned, 6) after the step for the mass-scaled momenta G' g (owned, 6), in any shape."""
-        change, momentum = np.empty_like(self.free_velocity), momentum.reshape(-1, 6)[: len(self.free_velocity)]
-        if isinstance(self.contact_map, JointedMap):
-            momentum = self.contact_map.coupled(momentum)
-        scale(self.contact_map.given.root, momentum, change)
+        change = np.empty_like(self.free_velocity)
+        self.contact_map.mass.scale(momentum.reshape(-1, 6), change)
         return self.free_velocity + change
 
-    def kept(self, world: World, velocity: Floats) -> Floats:
+    def kept(self, velocity: Floats) -> Floats | None:
         """The velocities (owned, 6) with which bodies go into the next step, where those of this one are `velocity`:
-        the same but of bodies that are no spheres, see `dem.free_motion.kept_spin`."""
+        others of bodies that are no spheres, see `dem.free_motion.kept_spin`; None: the same."""
         if self.middle is None:
-            return velocity
+            return None
         own = self.near.bodies.take(slice(len(velocity)))
         out = velocity.copy()
         rows = np.flatnonzero(np.isfinite(self.middle[:, 0]))
@@ -286,9 +274,10 @@ class ContactSystem:
     def set_rate(self, world: World, momentum: Floats) -> None:
         """Give a cell that deforms the rate of its periods in this step, for the momenta of `velocity_with`;
         collective."""
-        if isinstance(self.contact_map, CellMap) and world.servo is not None:
-            rate = self.contact_map.rate_of(momentum.reshape(-1, 6) + self._attracted)
-            world.servo = replace(world.servo, rate=self.contact_map.cell.free + rate)
+        mass = self.contact_map.mass
+        if isinstance(mass, CellMass) and world.servo is not None:
+            rate = mass.rate_of(momentum.reshape(-1, 6) + self._attracted)
+            world.servo = replace(world.servo, rate=mass.cell.free + rate)
 
     def take_flow(self, world: World, contacts: Contacts) -> None:
         """Take the drift of the contacts from the shear and the rate of the cell."""
@@ -314,22 +303,24 @@ class ContactSystem:
             return np.zeros(0)
         return self.joints.impulses(self._push(impulse, moment))
 
-    def spent_with(self, large: Floats) -> Ints | None:
-        """`Drives.refound` for the velocities (large, 6) of large bodies after the step."""
-        return self.drives.refound(self.drive_impulse(large), large)
-
-    def joints_with(self, world: World, impulse: Floats, moment: Floats | None = None) -> Coupling | None:
-        """The joints of the step if these impulses and moments of contacts (nc, 3) show that other limits and motors
-        hold, else None; collective."""
-        if self.joints is None or not self.joints.decides:
+    def refound(self, world: World, impulse: Floats, velocity: Floats) -> UnconstrainedMotion | None:
+        """The motion with other joints and drives, where the impulses (parts nc, 3) of the cone problem and the
+        velocities (owned, 6) show that other limits and motors hold, or that drives are too weak; else None.
+        Collective."""
+        known, joints, spent = self.motion, None, None
+        if self.joints is not None and self.joints.decides:
+            joints = joints_refound(world, self.joints, self._push(*self.parts(impulse)))
+        if self.drives.most.any():
+            large = large_velocity(world, known, velocity)
+            spent = self.drives.refound(self.drive_impulse(large), large)
+        if joints is None and spent is None:
             return None
-        return joints_refound(world, self.joints, self._push(impulse, moment))
+        known = known if joints is None else replace(known, joints=joints)
+        return known if spent is None else known.with_spent(world, spent)
 
     def _push(self, impulse: Floats, moment: Floats | None) -> Floats:
         """What contacts alone give the jointed bodies (n, 6), mass-scaled."""
-        known = self.problem_map
-        assert isinstance(known, JointedMap)
-        return known.gathered(known.free.momenta(impulse if moment is None else np.concatenate([impulse, moment])))
+        return self.problem_map.shared(impulse if moment is None else np.concatenate([impulse, moment]))
 
     def drive_impulse(self, large: Floats) -> Floats:
         """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities
@@ -337,24 +328,19 @@ class ContactSystem:
         line, slip = self.drives.line, self.free_large - large
         return self.drives.impulse + (self.drives.grip * np.einsum("bi,bi->b", line, slip))[:, None] * line
 
-    def works(
-        self, impulse: Floats, before: Floats, grains: Floats, large: Floats, moment: Floats | None = None
-    ) -> tuple[float, float, Floats]:
-        """The work of this rank's normal impulses, and of its tangential ones and moments (nc, 3), on the mean of two
-        velocities [J], and the normal velocities (nc,) of the second ones: `before` (rows, 6) are of all rows of
-        `near`, the second of the local grains (grains, 6) and of the large bodies (large, 6); collective."""
-        after = np.zeros_like(before)
-        after[: self.near.grains] = grains
-        self.contact_map.halo.update(after)
-        after[self.near.grains + self.near.ghosts :] = large
-        normal, tangential, opening = self.contact_map.works(impulse, before, after)
-        if self.drift is not None:
-            normal, opening = normal + float(impulse[:, 0] @ self.drift[:, 0]), opening + self.drift[:, 0]
-            tangential += float(np.vdot(impulse[:, 1:], self.drift[:, 1:]))
-        if moment is not None and self.resistance is not None:
-            turning = self.resistance.map.turning
-            tangential += 0.5 * float(np.vdot(moment, turning(before) + turning(after)))
-        return normal, tangential, opening
+
+def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> ContactMap:
+    """The map of contacts with these frames (nc, 3, 3), of bodies that nothing couples beside them; collective."""
+    near, owned, moves = contacts.near, world.owned, bodies.is_dynamic(contacts.near.bodies)
+    # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
+    row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
+    arm = contact_arms(contacts, near.bodies.position, row)
+    rows = CompactRows(frame.reshape(-1, 9), arm, body, inverse_root_masses(world, drives), owned)
+    ghosts = np.flatnonzero(touched)
+    index = near.index[ghosts]
+    owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
+    halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
+    return ContactMap(world.comm, rows, halo, row)
 
 
 def gap_velocities(

@@ -7,6 +7,7 @@ the record take what they need from it. No other part of a step asks motions, lo
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from mpi4py import MPI
@@ -15,10 +16,11 @@ from dem import bodies, joints
 from dem.applied import Applied, applied_impulses, ends_of, row_of
 from dem.arrays import Floats, Ints
 from dem.checks import positive
-from dem.drives import Drives, drives_of
+from dem.drives import Drives, drives_of, given_velocities
 from dem.free_motion import fallen, free_spin, free_velocity, gyroscopic, velocity_changes
-from dem.motion import Pose, velocity_between
+from dem.motion import Pose
 from dem.neighbourhood import Neighbourhood
+from dem.together import together
 from dem.world import World
 
 
@@ -28,14 +30,19 @@ class UnconstrainedMotion:
 
     dt: float  #: [s]
     poses: dict[int, Pose]  #: of large bodies of prescribed motion at the end of the step, by row
-    prescribed: Floats  #: (large, 6) mean velocities of these; other bodies keep theirs [m/s, rad/s]
+    given: Floats  #: (large, 6) mean velocities that motions give, see `dem.drives.given_velocities` [m/s, rad/s]
+    prescribed: Floats  #: (large, 6) of prescribed motions the same; other bodies keep theirs
     applied: Applied | None  #: what loads and springs give; None without any
     drives: Drives  #: of the large bodies, the same on all ranks
     grains: Floats  #: (grains, 6) velocities of this rank's grains [m/s, rad/s]
+    #: (owned, 6) mass-scaled momenta that contacts are expected to give, about which bodies that are no spheres and
+    #: joints are linearised; None until contacts are known, and if all bodies turn as spheres do
+    push: Floats | None = None
+    joints: joints.Coupling | None = None  #: with that push, and with what contacts have shown of them; likewise None
 
     def with_spent(self, world: World, spent: Ints) -> UnconstrainedMotion:
         """The same with drives that give all their strength, see `Drives.spent`; collective."""
-        return replace(self, drives=_drives(world, self.dt, self.prescribed, self.applied, spent))
+        return replace(self, drives=_drives(world, self.dt, self.given, self.applied, spent))
 
 
 def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
@@ -43,18 +50,19 @@ def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
     if dt is too large for the springs."""
     positive("time step", dt)
     poses = world.poses(world.time + dt)
-    prescribed = world.large.velocity.copy()
-    for row, end in poses.items():
-        prescribed[row] = velocity_between((world.large.position[row], world.large.quaternion[row]), end, dt)
-    applied, grains = applied_impulses(world, dt, prescribed), free_velocity(world.grains, world.gravity, dt)
+    given, moves = given_velocities(world, poses, dt), bodies.is_dynamic(world.large)
+    prescribed = np.where(moves[:, None], world.large.velocity, given)
+    applied, grains = applied_impulses(world, dt, given), free_velocity(world.grains, world.gravity, dt)
     if applied is not None:
         grains += velocity_changes(world.grains, applied.grains)
-    drives = _drives(world, dt, prescribed, applied, np.zeros(len(world.large), int))
-    return UnconstrainedMotion(dt, poses, prescribed, applied, drives, grains)
+    drives = _drives(world, dt, given, applied, np.zeros(len(world.large), int))
+    return UnconstrainedMotion(dt, poses, given, prescribed, applied, drives, grains)
 
 
-def _drives(world: World, dt: float, prescribed: Floats, applied: Applied | None, spent: Ints) -> Drives:
-    return drives_of(world, dt, prescribed, None if applied is None else applied.large, spent)
+def _drives(world: World, dt: float, given: Floats, applied: Applied | None, spent: Ints) -> Drives:
+    pushed = None if applied is None else applied.large
+    call = partial(drives_of, world, dt, given, pushed, spent)
+    return together(world.comm, "motion of a large body", call) if bodies.is_dynamic(world.large).any() else call()
 
 
 def large_velocity(world: World, free: UnconstrainedMotion, velocity: Floats) -> Floats:
@@ -116,7 +124,7 @@ def joint_coupling(world: World, free: UnconstrainedMotion, push: Floats | None 
     grains, large = np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity)
     if free.applied is not None:
         grains, large = free.applied.grains, free.applied.large
-    table = ends_of(world, ids, grains, large, free.prescribed, free.dt)
+    table = ends_of(world, ids, grains, large, free.given, free.dt)
     gathered = np.zeros_like(table.free)
     if push is not None:
         id = np.concatenate([world.grains.id, world.large.id])[: len(push)]

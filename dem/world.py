@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,6 +59,13 @@ class Servo:
         return -self.strain if time >= self.start - 1e-6 * dt else np.full(3, np.nan)
 
 
+#: The fields of a world that a step changes; what these refer to is replaced, and never changed in place.
+STATE = (
+    "grains", "large", "slabs", "only_spheres", "lists", "expected", "period", "shear", "servo", "tallies", "time",
+    "step", "spare",
+)  # fmt: skip
+
+
 @dataclass
 class World:
     """Bodies, materials and time.
@@ -104,6 +112,18 @@ class World:
 
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
+
+    def trial(self) -> World:
+        """A world that a step may change: this one stays as it is until it takes its state."""
+        other = copy(self)
+        other.grains, other.large = dataclasses.replace(self.grains), dataclasses.replace(self.large)
+        other.tallies = {name: dataclasses.replace(tally) for name, tally in self.tallies.items()}
+        return other
+
+    def take(self, trial: World) -> None:
+        """Take the state to which a step has brought a trial."""
+        for name in STATE:
+            setattr(self, name, getattr(trial, name))
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Arrays from which `dem.start.restored_world` makes this world again: rows of local grains, and replicated

@@ -465,6 +465,16 @@ table = pctt.Simulation(Mixer(n=1)).local  # one row for each grain of this rank
 print(len(table), "rows,", int(is_dynamic(table).sum()), "of them moved by forces")
 print("columns", ", ".join(table.columns()))
 
+# %% dem.unconstrained.UnconstrainedMotion
+from dem.scenes import Mixer
+from mpi4py import MPI
+
+from dem.start import new_world
+from dem.unconstrained import unconstrained
+
+free = unconstrained(new_world(Mixer(n=1).build(), MPI.COMM_SELF), dt=0.01)
+print("without contacts a grain falls at", round(free.grains[0, 2], 4), "m/s after", free.dt, "s")
+
 # %% dem.contact.Contacts, dem.system.ContactSystem, dem.step.Step, dem.impulses.ImpulseMemory
 import numpy as np
 from mpi4py import MPI

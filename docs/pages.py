@@ -37,8 +37,8 @@ PARTS = {
         "dem.checks", "dem.analysis",
     ],
     "What a time step is made of": [
-        "dem.start", "dem.world", "dem.bodies", "dem.contact", "dem.system", "dem.contact_map", "dem.step",
-        "dem.impulses", "dem.record", "dem.partition", "dem.neighbourhood",
+        "dem.start", "dem.world", "dem.bodies", "dem.unconstrained", "dem.contact", "dem.system", "dem.contact_map",
+        "dem.step", "dem.impulses", "dem.record", "dem.partition", "dem.neighbourhood",
     ],
     "Cone problems": ["pctt.ccp", "pctt.ccp.fclib"],
     "Preconditioners and tensor trains": ["pctt.pc", "pctt.mat", "pctt.tt"],
@@ -48,6 +48,7 @@ PARTS = {
 ONLY = {
     "pctt.simulation": ["Body"],
     "dem.scene": ["LargeBody", "Scene"],
+    "dem.unconstrained": ["UnconstrainedMotion", "unconstrained"],
     "dem.mesh": ["Mesh"],
     "dem.motion": ["Dynamic", "Fixed", "Glide", "Guided", "Held", "Hinged", "Oscillation", "Path", "Rotation"],
     "dem.loads": ["Load"],

@@ -151,19 +151,21 @@ class Simulation:
 
     def step(self) -> dict[str, Any]:
         """Make a step of dt; its `figures`. Warns of a jump of energy. SceneError if a body is lost, if code of the
-        scene fails, or if the contacts have no solution: the state is then that before the step."""
+        scene fails, or if the contacts have no solution: the state is then that before the step, which may be tried
+        again, but `last` is None."""
         if self._closed:
             raise ValueError("this simulation is closed")
         stepper, output, self.last = self.stepper, self.output, None  # frees the arrays of the last step
         try:
-            figures = stepper.step()
+            made = stepper.step()
         except NoSolutionError:
             if output:
                 output.keep()
             raise
-        self.last = Step(self.world, stepper.contacts, stepper.system, stepper.impulse, stepper.moment)
         with log.phase("output"):
-            self._row = recording.row(self.last, self.experiment)
+            row = recording.row(made.step, self.experiment)
+            stepper.take(made)
+            self.last, self._row, figures = made.step, row, made.figures
             figures["worst_overlap"] = self._row["worst_overlap [m]"]
             figures["energy_jump"] = self._row["energy_jump [J]"]
             if output:

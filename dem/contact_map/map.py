@@ -7,11 +7,10 @@ ghosts travel, the loops work on the contacts that do not touch ghosts.
 from __future__ import annotations
 
 import copy
-import operator
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -20,82 +19,8 @@ from dem.arrays import Floats, Ints
 from dem.compiled import loop, threads
 from dem.contact_map import loops
 from dem.contact_map.halo import Halo, find_halo
-from dem.exchange import refuse
-
-#: The entries (xx, xy, xz, yy, yz, zz) of a symmetric matrix among the nine, and the numbers (3, 3) of all among these.
-UPPER, SYMMETRIC = [0, 1, 2, 4, 5, 8], [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
-
-
-@dataclass(frozen=True)
-class CompactRows:
-    """Contacts of rigid bodies: 15 numbers per contact, while two 3 x 6 blocks have 36 numbers.
-
-    In the frame F of a contact, body b has the velocity F (v_b + w_b x r_b - v_a - w_a x r_a) relative to body a.
-    Put the contacts between two own bodies first: a product does not wait for other ranks until it reaches the first
-    contact with a body of another rank.
-
-    Attributes
-    ----------
-    frame : (nc, 9) rows normal, tangent 1, tangent 2 of F
-    arm : (nc, 6) r_a and r_b, from the centres of the bodies to the contact point (m)
-    body : (nc, 2) global indices of a and b; -1 for a body that no impulse moves
-    root : M^-1/2 of the bodies that this rank owns: (columns, 6) with its diagonals, or (columns, 12) with its two
-        symmetric blocks, for translation and rotation, as (xx, xy, xz, yy, yz, zz) each; the same width on all ranks
-    columns : number of bodies that this rank owns
-    """
-
-    frame: Floats
-    arm: Floats
-    body: Ints
-    root: Floats
-    columns: int
-
-    @property
-    def rows(self) -> int:
-        return len(self.frame)
-
-    def checked(self) -> CompactRows:
-        """The same arrays in the types that compiled loops trust; ValueError if they do not fit together."""
-        nc, columns = len(self.frame), operator.index(self.columns)
-        frame, arm = _array("frame", self.frame, float, (nc, 9)), _array("arm", self.arm, float, (nc, 6))
-        body = _array("body", self.body, np.int64, (nc, 2))
-        if body.min(initial=0) < -1:
-            raise ValueError(f"body of the rows has {body.min()}; allowed are indices of bodies, and -1 for no body")
-        return CompactRows(frame, arm, body, _array("root", self.root, float, (columns, 6), (columns, 12)), columns)
-
-
-@dataclass(frozen=True)
-class BlockRows:
-    """Local block rows of G in block CSR format: one row of 3 x 6 blocks per contact, one block column per body.
-
-    Attributes
-    ----------
-    indptr : (nc + 1,) index of the first block of each contact, and the number of blocks
-    indices : (nnz,) global block columns (bodies)
-    blocks : (nnz, 3, 6)
-    columns : number of block columns that this rank owns
-    """
-
-    indptr: Ints
-    indices: Ints
-    blocks: Floats
-    columns: int
-
-    @property
-    def rows(self) -> int:
-        return len(self.indptr) - 1
-
-    def checked(self) -> BlockRows:
-        """The same arrays in the types of the attributes; ValueError if they do not fit together."""
-        count = len(self.indices)
-        indptr = _array("indptr", self.indptr, np.int64, (max(len(self.indptr), 1),))
-        indices = _array("indices", self.indices, np.int64, (count,))
-        if indptr[0] != 0 or indptr[-1] != count or (np.diff(indptr) < 0).any():
-            raise ValueError(f"indptr of the rows does not ascend from 0 to the number of blocks, {count}")
-        if indices.min(initial=0) < 0:
-            raise ValueError(f"indices of the rows have {indices.min()}; allowed are indices of bodies")
-        blocks = _array("blocks", self.blocks, float, (count, 3, 6))
-        return BlockRows(indptr, indices, blocks, operator.index(self.columns))
+from dem.contact_map.mass import InverseMass
+from dem.contact_map.rows import BlockRows, CompactRows, checked, root_blocks
 
 
 class ContactMap:
@@ -106,6 +31,7 @@ class ContactMap:
     ask the other ranks. All products are collective.
 
     given : the rows; ValueError on all ranks for wrong ones
+    mass : what the inverse mass of the bodies is beside the blocks of ``given.root``, see `dem.contact_map.mass`
     halo, body : the halo, and (nc, 2) the rows of the bodies in its tables, uint32, for ``given`` that needs no check.
         They are found from the global indices of the bodies if they are not given.
     precision : of the arrays that products take and return; single precision moves half of the bytes
@@ -121,15 +47,16 @@ class ContactMap:
         halo: Halo | None = None,
         body: np.ndarray | None = None,
         precision: type[np.floating] = np.float64,
+        mass: InverseMass | None = None,
     ):
         if halo is None or body is None:
             given = checked(comm, given)
             halo, body = find_halo(comm, given.columns, given.body)
         self.comm, self.given, self.halo, self.body, self.precision = comm, given, halo, body, precision
-        self.rows, self.columns = given.rows, given.columns
+        self.mass = InverseMass(given.root, precision) if mass is None else mass
+        self.rows, self.columns, self.couples = given.rows, given.columns + self.mass.more, self.mass.couples
         self.log_flops: Callable[[float], None] = lambda count: None  #: told how many operations a product took
         self._arrays = self._floats(given.frame), self._floats(given.arm), body
-        self._root, self._mass = self._floats(given.root), self._floats(_square(given.root))
         self._w, self._m = np.zeros((2, halo.rows, 6), precision)
         ghost = np.zeros(halo.rows, bool)
         ghost[halo.ghosts] = True
@@ -137,13 +64,18 @@ class ContactMap:
         self._set_parts()
         self._flops = 45 * self.rows + 6 * self.columns
 
+    def with_mass(self, mass: InverseMass) -> ContactMap:
+        """The same rows between bodies of another inverse mass."""
+        return ContactMap(self.comm, self.given, self.halo, self.body, self.precision, mass)
+
     # -- products -------------------------------------------------------------------------------------------
 
     def velocities(self, v: Floats) -> Floats:
         """G v (nc, 3)."""
-        y = np.zeros((self.rows, 3), self.precision)
-        self._enter(self._root, shaped("velocities of bodies", v, self.columns, 6))
+        y, v = np.zeros((self.rows, 3), self.precision), shaped("velocities of bodies", v, self.columns, 6)
+        self._enter(v)
         self._set_velocities(y, y)
+        self.mass.add_rates(v, y)
         self.log_flops(self._flops)
         return y
 
@@ -151,23 +83,33 @@ class ContactMap:
         """G' g (columns, 6)."""
         self._collect(g, self._m)
         self.log_flops(self._flops)
-        return self._left()
+        return self.mass.momenta(g.reshape(-1, 3), self._m)
 
     def add_delassus(self, g: Floats, y: Floats) -> None:
         """y += G G' g; y (nc, 3) is C-contiguous."""
         y = shaped("velocities of contacts", y, self.rows, 3)
         self._collect(g, self._m)
-        self._enter(self._mass, self._m)
+        shared = self._share(g, self._m)
+        loops.scale(self.mass.alone, self._m, self._w)
+        self._send(shared)
         self._set_velocities(y, y)
+        self.mass.add_contacts(shared, y)
         self.log_flops(2 * self._flops)
 
-    # What an iterate x is to the bodies: its image, the momenta D x, from which velocities G G'x and energies x'G G'x
-    # follow. A map of those contacts `only` that have impulses finds the same image.
+    def shared(self, g: Floats) -> Floats:
+        """The shared coordinates (mass.shared, 6) of impulses g (nc, 3), see `dem.contact_map.mass`."""
+        self._collect(g, self._m)
+        return self._share(g, self._m)
+
+    # What an iterate x is to the bodies: its image, the momenta D x and behind them its shared coordinates, from which
+    # velocities G G'x and energies x'G G'x follow. A map of those contacts `only` that have impulses finds the same
+    # image.
 
     def only(self, contacts: Ints) -> ContactMap:
         """The map of these contacts, ascending, for images and what follows from them: it shares the memory for
         velocities and momenta with this one."""
         other = copy.copy(self)
+        other.mass = self.mass.only(contacts)
         other._take(contacts)
         return other
 
@@ -176,7 +118,7 @@ class ContactMap:
         self._arrays = frame, arm, self.body
         self.rows, self._first_away = len(contacts), int(np.searchsorted(contacts, self._first_away))
         self._flops = 45 * self.rows + 6 * self.columns
-        for name in ("_pieces", "_forces", "_ends", "block_rows"):
+        for name in ("_pieces", "_forces", "_ends", "body_rows", "block_rows"):
             self.__dict__.pop(name, None)
         self._set_parts()
 
@@ -190,24 +132,31 @@ class ContactMap:
         return (here, *(array[here] for array in self._arrays))
 
     def image(self) -> Floats:
-        """Memory for an image: momenta (halo.rows, 6)."""
-        return np.zeros((self.halo.rows, 6), self.precision)
+        """Memory for an image: momenta (halo.rows, 6), and the shared coordinates (mass.shared, 6)."""
+        return np.zeros((self.halo.rows + self.mass.shared, 6), self.precision)
 
     def find_image(self, x: Floats, image: Floats) -> None:
         """image = D x for impulses x (nc, 3)."""
-        self._collect(x, image)
+        count = self.halo.rows
+        self._collect(x, image[:count])
+        self.mass.share(x, image[:count], image[count:])
         self.log_flops(self._flops)
 
     def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats) -> None:
         """y = before + G G' z (nc, 3) for the z whose image is image + beta (image - last)."""
-        loops.scale_extrapolated(self._mass, image, last, beta, self._w)
-        self.halo.begin_update(self._w)
+        count = self.halo.rows
+        shared = image[count:] + self.precision(beta) * (image[count:] - last[count:])
+        loops.scale_extrapolated(self.mass.alone, image, last, beta, self._w)
+        self._send(shared)
         self._set_velocities(before, y)
+        self.mass.add_contacts(shared, y)
         self.log_flops(self._flops + 12 * self.columns)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
         """d'GG'd of this rank's bodies, for the step d that leads from this z to the x with the image ``new``."""
-        return loops.energy_of_step(self._mass, new, image, last, beta)
+        new_s, s, last_s = (x[self.halo.rows :] for x in (new, image, last))
+        energy = loops.energy_of_step(self.mass.alone, new, image, last, beta)
+        return energy + self.mass.energy(new_s - s - self.precision(beta) * (s - last_s))
 
     def weights(self, H: Floats, symmetric: bool = True) -> Floats:
         """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
@@ -218,7 +167,7 @@ class ContactMap:
     def through(self, weight: Floats, v: Floats, out: Floats) -> None:
         """out = v + G' H G v (columns, 6); out is C-contiguous."""
         v = v.reshape(-1, 6)
-        self._enter(self._root, v)
+        self._enter(v)
         if threads() > 1:
             _, arm, body = self._arrays
             self.halo.end_update(self._w)
@@ -226,7 +175,7 @@ class ContactMap:
             self._sum_forces(self._m)
         else:
             self._add_through(weight)
-        np.add(v, self._left(), out=out.reshape(-1, 6))
+        np.add(v, self.mass.momenta(np.empty((0, 3)), self._m), out=out.reshape(-1, 6))
         self.log_flops(72 * self.rows + 18 * self.columns)
 
     def _add_through(self, weight: Floats) -> None:
@@ -263,12 +212,23 @@ class ContactMap:
         loops.add_momenta(frame[contacts], arm[contacts], body[contacts], g[contacts], sums)
         return sums
 
-    def _enter(self, scale: Floats, v: Floats) -> None:
+    def _enter(self, v: Floats) -> None:
         """Store R v for the own bodies, and begin to send it to the ranks with ghosts of them.
 
         The caller must call `end_update` later.
         """
-        loops.scale(scale, v, self._w)
+        self.mass.scale(v, self._w)
+        self.halo.begin_update(self._w)
+
+    def _share(self, g: Floats, m: Floats) -> Floats:
+        """The shared coordinates (mass.shared, 6) of impulses that give bodies the momenta m."""
+        shared = np.zeros((self.mass.shared, 6), self.precision)
+        self.mass.share(g.reshape(-1, 3), m, shared)
+        return shared
+
+    def _send(self, shared: Floats) -> None:
+        """Add the velocities by shared coordinates to those of the own bodies, and begin to send them as `_enter`."""
+        self.mass.add_bodies(shared, self._w)
         self.halo.begin_update(self._w)
 
     def _set_velocities(self, before: Floats, y: Floats) -> None:
@@ -296,7 +256,7 @@ class ContactMap:
 
     def _sum_forces(self, m: Floats) -> None:
         """m = the momenta of the bodies by the impulses in ``_forces``, on several threads."""
-        (start, ends), (_, arm, _), own = self._ends, self._arrays, self.columns
+        (start, ends), (_, arm, _), own = self._ends, self._arrays, self.halo.own
         loops.sum_forces(start[own:], ends, arm, self._forces, m[own:])
         self.halo.begin_add(m)
         loops.sum_forces(start[: own + 1], ends, arm, self._forces, m[:own])
@@ -309,7 +269,7 @@ class ContactMap:
     @cached_property
     def _ends(self) -> tuple[Ints, Ints]:
         moves = np.zeros(self.halo.rows, bool)
-        moves[: self.columns] = moves[self.halo.ghosts] = True
+        moves[: self.halo.own] = moves[self.halo.ghosts] = True
         return loops.ends_of_bodies(self.body, moves)
 
     def _add(self, loop: Callable[..., None], part: tuple[Any, ...], each: Floats, *others: Floats) -> None:
@@ -318,21 +278,16 @@ class ContactMap:
         if here.stop > here.start:
             loop(*arrays, each[here], *others)
 
-    def _left(self) -> Floats:
-        """The scaled momenta of the own bodies."""
-        out = np.empty((self.columns, 6), self.precision)
-        loops.scale(self._root, self._m, out)
-        return out
-
     # -- parts of matrices ----------------------------------------------------------------------------------
 
     def contact_blocks(self) -> Floats:
         """The diagonal blocks of G G' (nc, 3, 3)."""
         out = np.empty((self.rows, 3, 3), self.precision)
-        mass = np.zeros((self.halo.rows, self._mass.shape[1]), self.precision)
-        mass[: self.columns] = self._mass
+        mass = np.zeros((self.halo.rows, self.mass.square.shape[1]), self.precision)
+        mass[: self.halo.own] = self.mass.square
         self.halo.update(mass)
         loops.contact_blocks(*self._arrays, mass, out)
+        self.mass.add_blocks(out)
         return out
 
     def body_blocks(self, weight: Floats) -> Floats:
@@ -340,12 +295,12 @@ class ContactMap:
         blocks = np.zeros((self.halo.rows, 6, 6), self.precision)
         loops.add_body_blocks(*self._arrays, weight, blocks)
         self.halo.add(blocks)
-        own = blocks[: self.columns]
-        if self._root.shape[1] == 6:
-            own *= self._root[:, :, None] * self._root[:, None, :]
+        own, root = blocks[: self.columns], self.mass.root
+        if root.shape[1] == 6:
+            own *= root[:, :, None] * root[:, None, :]
         else:
             roots = np.zeros((self.columns, 6, 6))
-            roots[:, :3, :3], roots[:, 3:, 3:] = root_blocks(self._root).transpose(1, 0, 2, 3)
+            roots[:, :3, :3], roots[:, 3:, 3:] = root_blocks(root).transpose(1, 0, 2, 3)
             own = roots @ own @ roots
         own[:, range(6), range(6)] += 1.0
         return own
@@ -354,7 +309,8 @@ class ContactMap:
         """The map with its rows multiplied by ``size`` (nc, 3)."""
         frame = np.empty((self.rows, 9), precision)
         loops.scale_frames(self.given.frame, size, frame)
-        other = ContactMap(self.comm, replace(self.given, frame=frame), self.halo, self.body, precision)
+        mass = self.mass.scaled(size, precision)
+        other = ContactMap(self.comm, replace(self.given, frame=frame), self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
         if threads() > 1:
             other._ends = self._ends
@@ -367,6 +323,11 @@ class ContactMap:
     @cached_property
     def block_rows(self) -> BlockRows:
         """The rows as 3 x 6 blocks; collective at its first use."""
+        return self.mass.rows(self.comm, self.body_rows)
+
+    @cached_property
+    def body_rows(self) -> BlockRows:
+        """The rows as 3 x 6 blocks without what couples bodies; collective at its first use."""
         return self.rows_of_blocks(self.frame_blocks())
 
     def frame_blocks(self) -> Floats:
@@ -378,7 +339,7 @@ class ContactMap:
         """The rows that such blocks (nc, 2, 3, 6) make; collective."""
         given = self.given
         root = np.zeros((self.halo.rows, given.root.shape[1]))
-        root[: self.columns] = given.root
+        root[: given.columns] = given.root
         self.halo.update(root)
         order = np.argsort(given.body, axis=1)
         blocks = blocks * np.array([-1.0, 1.0])[:, None, None]
@@ -387,7 +348,7 @@ class ContactMap:
         blocks = np.take_along_axis(blocks, order[:, :, None, None], axis=1)[moves]
         both = root_blocks(root)[local[moves]]
         blocks = np.concatenate([blocks[:, :, :3] @ both[:, 0], blocks[:, :, 3:] @ both[:, 1]], axis=2)
-        return BlockRows(np.concatenate([[0], np.cumsum(moves.sum(axis=1))]), body[moves], blocks, self.columns)
+        return BlockRows(np.concatenate([[0], np.cumsum(moves.sum(axis=1))]), body[moves], blocks, given.columns)
 
     def _floats(self, array: Floats) -> Floats:
         return np.ascontiguousarray(array, dtype=self.precision)
@@ -401,62 +362,6 @@ def shaped(name: str, x: Floats, rows: int, width: int) -> Floats:
     if x.shape not in ((rows, width), (rows * width,)):
         raise ValueError(f"{name} of the shape {x.shape}; allowed is {(rows, width)}")
     return x.reshape(rows, width)
-
-
-AnyRows = TypeVar("AnyRows", CompactRows, BlockRows)
-
-
-def checked(comm: MPI.Comm, rows: AnyRows) -> AnyRows:
-    """The same rows as C-contiguous arrays of float64 and int64, as the compiled loops trust. Collective.
-
-    ValueError on all ranks if shapes do not fit or bodies do not exist.
-    """
-    wrong, figures = "", np.zeros(3, np.int64)
-    try:
-        rows = rows.checked()
-        body, root = (rows.body, rows.root) if isinstance(rows, CompactRows) else (rows.indices, np.zeros((0, 0)))
-        figures[:] = rows.columns, body.max(initial=-1), root.shape[1]
-    except (TypeError, ValueError) as error:
-        wrong = str(error)
-    refuse(comm, wrong)
-    everywhere = np.empty((comm.size, 3), np.int64)
-    comm.Allgather(figures, everywhere)
-    bodies, last, width = everywhere[:, 0].sum(), everywhere[:, 1].max(), everywhere[:, 2]
-    if last >= bodies:
-        raise ValueError(f"a contact has the body {last}, but there are {bodies} bodies")
-    if np.ptp(width):
-        raise ValueError("root of the rows has another width on some ranks")
-    return rows
-
-
-def _array(name: str, given: np.ndarray, kind: type, *shapes: tuple[int, ...]) -> np.ndarray:
-    """A C-contiguous array of this type and of one of the shapes; ValueError for other data."""
-    array = np.asarray(given)
-    if array.shape not in shapes:
-        raise ValueError(f"{name} of the rows has the shape {array.shape}; allowed is {' or '.join(map(str, shapes))}")
-    if array.dtype.kind not in ("iu" if kind is np.int64 else "fiu") and array.size:
-        raise ValueError(f"{name} of the rows has the type {array.dtype}; allowed is {np.dtype(kind).name}")
-    return np.ascontiguousarray(array, dtype=kind)
-
-
-def root_blocks(root: Floats) -> Floats:
-    """Matrices in the format of `CompactRows.root` as blocks (n, 2, 3, 3)."""
-    if root.shape[1] == 6:
-        return root.reshape(-1, 2, 3, 1) * np.eye(3)
-    return root.reshape(-1, 2, 6)[:, :, SYMMETRIC]
-
-
-def packed(blocks: Floats) -> Floats:
-    """Symmetric blocks (n, 2, 3, 3) as (n, 12), the inverse of `root_blocks`."""
-    return blocks.reshape(-1, 2, 9)[:, :, UPPER].reshape(-1, 12)
-
-
-def _square(root: Floats) -> Floats:
-    """R^2, in the format of R."""
-    if root.shape[1] == 6:
-        return root * root
-    blocks = root_blocks(root)
-    return packed(blocks @ blocks)
 
 
 @loop

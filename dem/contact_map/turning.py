@@ -14,7 +14,9 @@ from dem.arrays import Floats, Ints
 from dem.compiled import loop
 from dem.contact_map import loops
 from dem.contact_map.halo import Halo
-from dem.contact_map.map import BlockRows, CompactRows, ContactMap, root_blocks, shaped
+from dem.contact_map.map import ContactMap, shaped
+from dem.contact_map.mass import InverseMass
+from dem.contact_map.rows import BlockRows, CompactRows, root_blocks
 
 
 class TurningMap(ContactMap):
@@ -26,11 +28,15 @@ class TurningMap(ContactMap):
 
     def __init__(
         self, comm: MPI.Comm, given: CompactRows, turn: Floats, halo: Halo, body: np.ndarray,
-        precision: type[np.floating] = np.float64,
+        precision: type[np.floating] = np.float64, mass: InverseMass | None = None,
     ):  # fmt: skip
-        super().__init__(comm, given, halo, body, precision)
+        super().__init__(comm, given, halo, body, precision, mass)
         self._given_turn, self._turn = turn, self._floats(turn)
         self.contacts, self.rows = given.rows, 2 * given.rows
+
+    def with_mass(self, mass: InverseMass) -> TurningMap:
+        """The same rows between bodies of another inverse mass."""
+        return TurningMap(self.comm, self.given, self._given_turn, self.halo, self.body, self.precision, mass)
 
     def turning(self, v: Floats) -> Floats:
         """The turning velocities (nc, 3) of the velocities (rows, 6) of all rows of a table of the halo, without a
@@ -71,7 +77,7 @@ class TurningMap(ContactMap):
         """The diagonal blocks of G G' (2 nc, 3, 3)."""
         out = super().contact_blocks()
         inverse = np.zeros((self.halo.rows, 9), self.precision)
-        inverse[: self.columns] = root_blocks(self._mass)[:, 1].reshape(-1, 9)
+        inverse[: self.halo.own] = root_blocks(self.mass.square)[:, 1].reshape(-1, 9)
         self.halo.update(inverse)
         both = inverse[self.body[:, 0]] + inverse[self.body[:, 1]]
         turn = self._turn.reshape(-1, 3, 3)
@@ -82,19 +88,20 @@ class TurningMap(ContactMap):
         """The map with its rows multiplied by ``size`` (2 nc, 3)."""
         rows = np.concatenate([self.given.frame, self._given_turn]).reshape(-1, 3, 3) * size[:, :, None]
         frame, turn = rows.reshape(2, -1, 9)
-        other = TurningMap(self.comm, replace(self.given, frame=frame), turn, self.halo, self.body, precision)
+        mass = self.mass.scaled(size, precision)
+        other = TurningMap(self.comm, replace(self.given, frame=frame), turn, self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
         return other
 
     @cached_property
-    def block_rows(self) -> BlockRows:
-        """The rows as 3 x 6 blocks; collective at its first use."""
+    def body_rows(self) -> BlockRows:
+        """The rows as 3 x 6 blocks without what couples bodies; collective at its first use."""
         turning = np.zeros((self.contacts, 2, 3, 6))
         turning[..., 3:] = self._given_turn.reshape(-1, 1, 3, 3)
         one, two = self.rows_of_blocks(self.frame_blocks()), self.rows_of_blocks(turning)
         indptr = np.concatenate([one.indptr, one.indptr[-1] + two.indptr[1:]])
         both = np.concatenate([one.indices, two.indices]), np.concatenate([one.blocks, two.blocks])
-        return BlockRows(indptr, *both, self.columns)
+        return BlockRows(indptr, *both, self.given.columns)
 
 
 @loop

@@ -19,7 +19,8 @@ from petsc4py import PETSc
 
 from dem.compiled import loop
 from dem.contact_map import BlockRows, ContactMap, Halo, find_halo, loops
-from dem.contact_map.map import checked, shaped
+from dem.contact_map.map import shaped
+from dem.contact_map.rows import checked
 from dem.exchange import exchange, offsets
 from pctt.blocks import Array, square_block_matrix
 
@@ -162,7 +163,8 @@ class BlockMap(ContactMap):
         precision: type[np.floating] = np.float64,
     ):  # fmt: skip
         rows = checked(comm, rows) if halo is None else rows
-        self.comm, self.given, self.block_rows, self.precision = comm, rows, rows, precision  # type: ignore[assignment]
+        self.comm, self.given, self.precision = comm, rows, precision  # type: ignore[assignment]
+        self.body_rows = self.block_rows = rows
         self.rows, self.columns = rows.rows, rows.columns
         self._found = halo or find_halo(comm, rows.columns, rows.indices)
         self.halo, body = self._found

@@ -12,8 +12,6 @@ import numpy as np
 
 from dem.compiled import loop
 from dem.contact_map import find_halo
-from dem.contact_map.cell import CellMap
-from dem.contact_map.jointed import JointedMap
 from pctt.ccp.cones import TINY, Array, tangential
 from pctt.ccp.delassus import ColumnMap, sums_of
 from pctt.ccp.problem import ConeProblem
@@ -89,7 +87,7 @@ def _left_over(problem: ConeProblem, d: Array) -> float:
     Collective."""
     assert problem.contact_map is not None
     known = problem.contact_map
-    G = (known.free if isinstance(known, (CellMap, JointedMap)) else known).block_rows
+    G = known.body_rows
     halo, body = find_halo(problem.comm, G.columns, G.indices)
     each = sums_of(body, (G.blocks**2).sum(axis=1), halo.rows)
     halo.add(each)

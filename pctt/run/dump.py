@@ -22,7 +22,7 @@ import scipy.sparse as sp
 
 from dem.contact_law import ContactLaw
 from dem.contact_map import ContactMap, root_blocks
-from dem.contact_map.map import packed
+from dem.contact_map.rows import packed
 from dem.exchange import offsets
 from dem.experiment import Experiment
 from dem.joints import Joint

@@ -310,7 +310,9 @@ def _settle(
         while world.step < end:
             if world.step + 1 >= end - end // 10:
                 stepper.settings = dataclasses.replace(loose, delta=at_rest, tol=0.1 * tol)
-            line = stepper.step()
+            made = stepper.step()
+            stepper.take(made)
+            line = made.figures
             interrupted = interrupt.asked(comm)
             if world.step % tenth == 0 or world.step == end or interrupted:
                 save(unfinished(path), made_with, world, memory)

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import resource
 import sys
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from dem.arrays import Ints, Keys
+from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
 from dem.exchange import reduced
 from dem.fast import refuse_passages
 from dem.impacts import in_order
 from dem.impulses import ImpulseMemory
-from dem.joints import Coupling
 from dem.partition import rebalance
 from dem.passage import come_and_go
 from dem.period import put_back
-from dem.step import advance, carried, find_overrun, find_turned
+from dem.step import Step, advance, carried, find_overrun, find_turned
 from dem.system import ContactSystem, contact_frames
 from dem.together import SceneError
-from dem.unconstrained import UnconstrainedMotion, large_velocity, unconstrained
+from dem.unconstrained import unconstrained
 from dem.world import World
 from pctt import ccp, log
 from pctt.ccp.cones import Array, Cones
@@ -31,23 +31,27 @@ from pctt.run import rest
 from pctt.run.dump import Dump
 from pctt.run.settings import Settings
 
+TRIES = 3  #: linearisations of turned contacts in a step, and of limits and motors that contacts have shown
+
 
 class NoSolutionError(SceneError):
     """The contacts of a step have no solution; the bodies are where they were before it."""
 
 
+@dataclass(frozen=True)
+class Made:
+    """A step that is made, and whose world no `Stepper` has taken yet."""
+
+    step: Step  #: its world is that at the end of the step
+    figures: dict[str, Any]  #: the line of the step in steps.jsonl
+    held: Array  #: (parts nc, 3) impulses with which springs begin the next step
+
+
 class Stepper:
-    """One time step after another of a world; keeps the last step's contacts and impulses for output.
+    """Makes the steps of a world, one after another.
 
-    Owns its ``newton`` and the PETSc objects of the present step; `destroy` frees them.
+    Owns its ``newton`` and keeps the impulses of the last step; `destroy` frees them.
     """
-
-    contacts: Contacts
-    motion: UnconstrainedMotion
-    system: ContactSystem
-    impulse: np.ndarray
-    moment: np.ndarray | None  #: where contacts resist rolling or spinning
-    history: list[float]  #: natural residual by iteration
 
     def __init__(
         self,
@@ -58,13 +62,7 @@ class Stepper:
         dump: Dump | None = None,
     ):
         self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
-        self._problem: ccp.ConeProblem | None = None
-        self._corrections = 0  # of the present step
-        # what joints hold in the present step, once its contacts have shown it, and how often
-        self._joints: Coupling | None = None
-        self._push: Array | None = None  # momenta that the contacts of the present step are expected to give
-        self._shown = 0
-        self._slabs: Ints | None = None  # those of the last step, or of a solution that is remembered within this one
+        self._slabs: Ints | None = None  # those of the last step, whose impulses the memory has
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
         if world.servo is not None and not np.isfinite(world.pairs.stiffness).all():
@@ -77,85 +75,123 @@ class Stepper:
         self.destroy()
 
     def destroy(self) -> None:
-        self._release()
         if self.newton is not None:
             self.newton.destroy()
 
-    def _release(self) -> None:
-        """Free the PETSc objects of the present problem."""
-        if self._problem is not None:
-            self._problem.destroy()
-            self._problem = None
-
-    def step(self) -> dict[str, Any]:
-        """Advance the world by dt; the step's figures. SceneError if a body is lost (its position is no number), or if
-        the contacts have no solution: any impulses would be invented, and those of the solver throw bodies away."""
-        servo = self.world.servo
+    def step(self) -> Made:
+        """Make a step of dt; the world stays as it is until `take`. SceneError if a body is lost (its position is no
+        number), if code of the scene fails, or if the contacts have no solution: any impulses would be invented, and
+        those of the solver throw bodies away."""
         try:
-            return self._step()
+            return self._made(self.world.trial())
         except FloatingPointError as error:  # raised on all ranks alike
-            self.world.servo = servo
             raise SceneError(f"step {self.world.step + 1}: {error}") from None
-        except SceneError:
-            self.world.servo = servo
-            raise
 
-    def _step(self) -> dict[str, Any]:
-        self._corrections, self._shown, self._joints, self._push = 0, 0, None, None
-        self._eased: tuple[Keys, Array] | None = None
-        self._smooth = False  # whether impacts of the present step are without friction
-        with log.phase("search"):
-            come_and_go(self.world)
-            put_back(self.world)
-            rebalance(self.world)
-            self.motion = unconstrained(self.world, self.settings.dt)
-            contacts = find_contacts(self.world, self.settings.delta, self.motion)
-            contacts = in_order(self.world, contacts, self.motion)
-        problem, guess, result = self._solved(contacts)
-        with log.phase("output"):
-            files = self.dump.step(self.system, problem, guess, result, result.asked or result) if self.dump else {}
-        if result.status is ccp.Status.UNBOUNDED:
-            raise NoSolutionError(
-                f"step {self.world.step + 1}: {result.reason}: rigid bodies are squeezed, and no impulses stop it; the "
-                "run ends with the state before. What helps: a -stiffness, a smaller -dt, or tools of bounded force"
-            )
-        with log.phase("advance"):
-            forces, moments = np.split(result.impulse, [len(self.contacts)])
-            self.impulse, self.history = self.system.net(forces), result.history
-            self.moment = None if self.system.resistance is None else moments
-            self.system.take_flow(self.world, self.contacts)
-            velocity = self.system.velocity_with(result.momentum)
-            kept = self.system.kept(self.world, velocity) if self.system.middle is not None else None
-            advance(self.world, self.motion, self.contacts, velocity, kept)
-            kept = self.system.held_after(result.impulse)  # with which springs begin the next step
-            self.memory.remember(self.system.key, kept, self.system.frame)
-            self._slabs = self.world.slabs
-        self._release()
-        return self._figures(problem.size, result, files)
+    def take(self, made: Made) -> None:
+        """Let the world and the memory be those at the end of this step."""
+        system = made.step.system
+        self.world.take(made.step.world)
+        self.memory.remember(system.key, made.held, system.frame)
+        self._slabs = self.world.slabs
 
-    def _solved(self, contacts: Contacts) -> tuple[ccp.ConeProblem, Array, ccp.Result]:
+    def _made(self, world: World) -> Made:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
-        problem, guess = self._assemble(contacts)
-        result = self.solve(problem, guess)
+        given, found, result, eased, smooth, turned, shown = self.settings, None, None, None, False, 0, 0
+        with log.phase("search"):
+            come_and_go(world)  # outlets take, sources add
+            put_back(world)  # into the periodic cell
+            rebalance(world)
+            free = unconstrained(world, given.dt)  # gravity, spin, loads, springs, drives, motions
+            contacts = in_order(world, find_contacts(world, given.delta, free), free)
         while True:
-            if self._locks(result):
-                problem, guess = self._assemble(self.contacts)
-            else:
-                again = self._unseen(result.momentum)
-                if again is None and self._machines_are(result) and not self._gains(result):
-                    return problem, guess, result
-                problem, guess = self._assemble(self.contacts if again is None else again, self._remembered(result))
-            result = self.solve(problem, guess).after(result)
+            with log.phase("assembly"):
+                last = self._recalled(world, contacts)
+                system = ContactSystem(world, contacts, free, given.recovery_speed, last, eased, smooth)
+                free = system.motion  # with the joints
+                guess = last if found is None else found.recall(system.key, system.frame, elsewhere=False)[0]
+                problem = cone_problem(system, world.comm)
+            with problem:
+                result = self._solved(world, system, problem, guess, result)
+                if not smooth and _locks(world, result):
+                    smooth = True
+                    continue
+                with log.phase("search"):  # bodies that meet unforeseen
+                    system.set_rate(world, result.momentum)
+                    velocity = system.velocity_with(result.momentum)  # v_free + M^-1 D g
+                    missed, turned = self._missed(world, system, velocity, turned)
+                with log.phase("assembly"):
+                    other = less = None
+                    if missed is None and shown < TRIES:  # limits reached, motors too weak
+                        other = system.refound(world, result.impulse, velocity)
+                        shown += other is not None
+                    if missed is other is None:  # impacts that would make energy
+                        less = system.eased(world, result.impulse, result.momentum)
+                if missed is other is less is None:
+                    files = self._dumped(system, problem, guess, result)
+                    break
+            found = _remembered(world, system, result)
+            contacts = contacts if missed is None else missed
+            free, eased = other or free, less or eased
+        _refuse_squeezed(world, result)
+        with log.phase("advance"):
+            system.take_flow(world, contacts)
+            advance(world, free, contacts, velocity, system.kept(velocity))
+            step = Step(world, contacts, system, *system.parts(result.impulse))
+            held = system.held_after(result.impulse)
+        return Made(step, self._figures(world, problem.size, result, files), held)
 
-    def _figures(self, contacts: int, result: ccp.Result, files: dict[str, Any]) -> dict[str, Any]:
+    def _recalled(self, world: World, contacts: Contacts) -> Array:
+        """The impulses (parts nc, 3) of the last step of these contacts."""
+        elsewhere = self._slabs is not world.slabs
+        return self.memory.recall(contacts.key, contact_frames(contacts.normal), elsewhere)[0]
+
+    def _solved(
+        self, world: World, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, before: ccp.Result | None
+    ) -> ccp.Result:
+        """The solution of a problem of the step as the settings say, with what that `before` has cost."""
+        settings = self.settings
+        with log.phase("solve"):
+            limits = rest.limits_of(settings.limits, world, system)
+            result = ccp.solve(problem, guess, settings.solver, limits, settings.options, self.newton, settings.law)
+            rest.account(world, limits, result)
+        return result if before is None else result.after(before)
+
+    def _missed(
+        self, world: World, system: ContactSystem, velocity: Array, turned: int
+    ) -> tuple[Contacts | None, int]:
+        """The contacts, with those that these velocities (owned, 6) show to be missed; None if there are none. A few
+        times a step with those that overlap at its end because bodies turn, by a tenth of delta: and how often now."""
+        settings, contacts, free = self.settings, system.contacts, system.motion
+        delta, recovery = settings.delta, settings.recovery_speed
+        left = settings.dt * settings.limits.closing_speed  # what a solution may leave of an overlap
+        deep = max(0.01 * delta, left if left < np.inf else 0.0)
+        wider = find_overrun(world, free, contacts, velocity, delta, deep, recovery)
+        if wider is not None:
+            wider = in_order(world, wider, free)
+            return carried(world, contacts, wider) if turned else wider, turned
+        if turned < TRIES and not world.only_spheres:
+            anew = find_turned(world, free, contacts, velocity, 0.1 * delta, recovery, turned)
+            if anew is not None:
+                return anew, turned + 1
+        refuse_passages(world, free, contacts, velocity, delta)
+        return None, turned
+
+    def _dumped(
+        self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result
+    ) -> dict[str, Any]:
+        """The entries of the figures for the files of the problem, if it is written."""
+        with log.phase("output"):
+            return self.dump.step(system, problem, guess, result, result.asked or result) if self.dump else {}
+
+    def _figures(self, world: World, contacts: int, result: ccp.Result, files: dict[str, Any]) -> dict[str, Any]:
         """The line of a step in steps.jsonl."""
         newton = self.newton
         pc_report = newton.linear.report() if newton is not None else []
         compare = newton.compare if newton is not None else None
         phases = ("search", "assembly", "solve", *(("compare",) if compare else ()), "advance")
         return {
-            "step": self.world.step,
-            "time": self.world.time,
+            "step": world.step,
+            "time": world.time,
             "contacts": contacts,
             "newton_its": result.newton_its,
             "iterations": result.iterations,
@@ -173,104 +209,30 @@ class Stepper:
             **({"pc_report": pc_report} if pc_report else {}),
             **files,
             **({"compare": compare.take_solves()} if compare else {}),
-            "peak_memory": _peak_memory(self.world.comm),
+            "peak_memory": _peak_memory(world.comm),
             "phases": log.take_seconds(phases),
         }
 
-    def _assemble(self, contacts: Contacts, found: ImpulseMemory | None = None) -> tuple[ccp.ConeProblem, Array]:
-        """The problem of these contacts, which takes the place of the last, and a guess: the impulses of the last step,
-        or those found within this one."""
-        self._release()
-        given = self.motion, self.settings.recovery_speed, self._joints
-        within = self._push, self._eased, self._smooth
-        with log.phase("assembly"):
-            place = contacts.key, contact_frames(contacts.normal)
-            last, _ = self.memory.recall(*place, self._slabs is not self.world.slabs)
-            self.contacts, self.system = contacts, ContactSystem(self.world, contacts, *given, last, *within)
-            self._push = self.system.push
-            guess = last if found is None else found.recall(*place, elsewhere=False)[0]
-            self.system.take_hold(last[: len(contacts)])
-            self._problem = cone_problem(self.system, self.world.comm)
-        return self._problem, guess
 
-    def _locks(self, result: ccp.Result) -> bool:
-        """Whether no impulses let bodies bounce as they are to, so that their impacts are to be without friction: in a
-        corner it may press a body on one wall as fast as the other sends it off."""
-        locked = result.status is ccp.Status.UNBOUNDED and not self._smooth
-        self._smooth = self._smooth or (locked and bool(self.world.pairs.restitution.any()))
-        return locked and self._smooth
+def _remembered(world: World, system: ContactSystem, found: ccp.Result) -> ImpulseMemory:
+    """A memory of these impulses of the contacts of a system."""
+    memory = ImpulseMemory(world.comm, world.pairs.parts)
+    memory.remember(system.key, found.impulse, system.frame)
+    return memory
 
-    def _unseen(self, momentum: Array) -> Contacts | None:
-        """The present contacts, with those that these momenta show to be missed; None if there are none. Three times a
-        step at most with those that overlap at its end because bodies turn, by a tenth of delta."""
-        world, settings, contacts, motion = self.world, self.settings, self.contacts, self.motion
-        delta, dt, recovery = settings.delta, settings.dt, settings.recovery_speed
-        with log.phase("search"):
-            velocity = self.system.velocity_with(momentum)
-            self.system.set_rate(world, momentum)
-            left = dt * settings.limits.closing_speed  # what a solution may leave of an overlap
-            deep = max(0.01 * delta, left if left < np.inf else 0.0)
-            wider = find_overrun(world, motion, contacts, velocity, delta, deep, recovery)
-            if wider is not None:
-                wider = in_order(world, wider, motion)
-                return carried(world, contacts, wider) if self._corrections else wider
-            if self._corrections < 3 and not world.only_spheres:
-                turned = find_turned(world, motion, contacts, velocity, 0.1 * delta, recovery, self._corrections)
-                if turned is not None:
-                    self._corrections += 1
-                    return turned
-            refuse_passages(world, motion, contacts, velocity, delta)
-            return None
 
-    def _remembered(self, found: ccp.Result) -> ImpulseMemory:
-        """A memory of these impulses of the present contacts."""
-        memory = ImpulseMemory(self.world.comm, self.world.pairs.parts)
-        memory.remember(self.system.key, found.impulse, self.system.frame)
-        return memory
+def _locks(world: World, result: ccp.Result) -> bool:
+    """Whether no impulses let bodies bounce as they are to, so that their impacts are to be without friction: in a
+    corner it may press a body on one wall as fast as the other sends it off."""
+    return result.status is ccp.Status.UNBOUNDED and bool(world.pairs.restitution.any())
 
-    def _machines_are(self, result: ccp.Result) -> bool:
-        """Whether the limits and motors that the step takes as holding, and the drives that it takes as strong enough,
-        are those with these impulses, or three others were tried; else the others are set. Collective."""
-        if self._shown == 3:
-            return True
-        with log.phase("assembly"):
-            joints, spent = self._joints_with(result), None
-            if self.system.drives.most.any():
-                velocity = self.system.velocity_with(result.momentum)
-                spent = self.system.spent_with(large_velocity(self.world, self.motion, velocity))
-        if joints is None and spent is None:
-            return True
-        self._joints = self._joints if joints is None else joints
-        self.motion = self.motion if spent is None else self.motion.with_spent(self.world, spent)
-        self._shown += 1
-        return False
 
-    def _gains(self, result: ccp.Result) -> bool:
-        """Whether impacts with these impulses make energy, and are to bounce less; collective."""
-        if not self.world.pairs.restitution.any():
-            return False
-        with log.phase("assembly"):
-            eased = self.system.eased(result.impulse, result.momentum)
-        self._eased = self._eased if eased is None else eased
-        return eased is not None
-
-    def _joints_with(self, result: ccp.Result) -> Coupling | None:
-        """The joints of the step with the limits and motors that hold with these impulses; None if they are those that
-        it takes. Collective."""
-        if self.system.joints is None:
-            return None
-        forces, moments = np.split(result.impulse, [len(self.contacts)])
-        resists = None if self.system.resistance is None else moments
-        return self.system.joints_with(self.world, self.system.net(forces), resists)
-
-    def solve(self, problem: ccp.ConeProblem, guess: Array) -> ccp.Result:
-        """Solve a problem of the step as the settings say."""
-        settings = self.settings
-        with log.phase("solve"):
-            limits = rest.limits_of(settings.limits, self.world, self.system)
-            result = ccp.solve(problem, guess, settings.solver, limits, settings.options, self.newton, settings.law)
-            rest.account(self.world, limits, result)
-            return result
+def _refuse_squeezed(world: World, result: ccp.Result) -> None:
+    if result.status is ccp.Status.UNBOUNDED:
+        raise NoSolutionError(
+            f"step {world.step + 1}: {result.reason}: rigid bodies are squeezed, and no impulses stop it; the "
+            "run ends with the state before. What helps: a -stiffness, a smaller -dt, or tools of bounded force"
+        )
 
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:

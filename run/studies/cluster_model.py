@@ -147,7 +147,7 @@ def steps(n: int) -> Row:
         with solve:
             sim.step()
         rows.append(solve.row | {"outside_s": time.process_time() - start - solve.row["solve_s"]})
-        rows[-1] |= {"contacts": len(sim.stepper.contacts), "new_lists": sim.world.lists is not lists}
+        rows[-1] |= {"contacts": len(sim.last.contacts), "new_lists": sim.world.lists is not lists}
     del rows[:3]
     row: Row = {"n": n, "ranks": comm.size}
     row |= {name: statistics.median(one[name] for one in rows) for name in ("its", "contacts", "outside_s")}

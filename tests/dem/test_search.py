@@ -218,6 +218,15 @@ def test_a_free_large_body_touches_other_large_bodies():
     np.testing.assert_array_equal(contacts.owned, [0])
 
 
+def test_a_search_changes_nothing_in_the_world():
+    world = new_world(heap(1, side=3), SELF)
+    before, tables = dict(vars(world)), [dict(table.columns()) for table in (world.grains, world.large)]
+    assert find_contacts(world, 0.02, unconstrained(world, 0.01)).owned.any()
+    assert vars(world) == before
+    for table, columns in zip((world.grains, world.large), tables):
+        assert all(column is columns[name] for name, column in table.columns().items())
+
+
 def test_a_lost_grain_is_an_error():
     world = new_world(heap(1, side=3), SELF)
     world.grains.position[4, 1] = np.nan

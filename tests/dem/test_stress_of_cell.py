@@ -5,7 +5,7 @@ import pytest
 from mpi4py import MPI
 
 import pctt
-from dem.contact_map.cell import CellMap
+from dem.contact_map.mass import CellMass, InverseMass
 from dem.scene import Scene
 from dem.servo import CLOSING, KEPT, LEADING
 from dem.shapes import Plane
@@ -139,10 +139,10 @@ def test_products_with_the_map_of_a_cell_are_those_of_a_matrix(turning):
     comm = MPI.COMM_WORLD
     sim = packed(comm, rolling=5e-4 * turning, spinning=1e-4 * turning)
     sim.run(steps=2)
-    system, random = sim.stepper.system, np.random.default_rng(comm.rank)
-    free = system.resistance.map if turning else system.contact_map.free
+    system, random = sim.last.system, np.random.default_rng(comm.rank)
     cell = system.cell._replace(root=np.array([2.0, 0.0, 3.0]))
-    G, count = CellMap(free, cell), len(cell.lever)
+    root, count = system.contact_map.given.root, len(cell.lever)
+    free, G = (system.problem_map.with_mass(mass) for mass in (InverseMass(root), CellMass(comm, root, cell)))
     g, other = random.normal(size=(2, G.rows, 3))
     lever = cell.lever.reshape(-1, 3, 3) * cell.root
     push = comm.allreduce(np.einsum("cij,ci->j", lever, g[:count]))

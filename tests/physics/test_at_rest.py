@@ -152,21 +152,21 @@ def test_what_moves_is_solved_to_the_limits_alone():
     for scene in (flying, passing):
         sim = pctt.Simulation(scene)
         sim.step()
-        limits = rest.limits_of(sim.settings.limits, sim.world, sim.stepper.system)
+        limits = rest.limits_of(sim.settings.limits, sim.world, sim.last.system)
         assert limits.aim == 1.0
 
 
 def test_iterations_that_lead_nowhere_are_counted():
     sim = pctt.Simulation(column(2))
     sim.run(steps=60)
-    world, limits = sim.world, rest.limits_of(sim.settings.limits, sim.world, sim.stepper.system)
+    world, limits = sim.world, rest.limits_of(sim.settings.limits, sim.world, sim.last.system)
     assert (limits.aim, limits.spare) == (rest.AIM, rest.ATTEMPT)
     failed = pctt.ccp.Result(np.zeros((0, 3)), pctt.ccp.Status.CONVERGED, "", 1e-4, 160, beyond=100)
     before = world.spare = 500.0
     rest.account(world, limits, failed)
     assert world.spare == before - 100 + rest.SHARE * 160
     world.spare = rest.ATTEMPT - 1.0
-    assert rest.limits_of(sim.settings.limits, world, sim.stepper.system).spare == 0
+    assert rest.limits_of(sim.settings.limits, world, sim.last.system).spare == 0
     failed.residual = limits.aimed
     rest.account(world, limits, failed)
     assert world.spare == rest.SPARE

@@ -395,12 +395,20 @@ def test_rows_of_the_map_are_those_of_its_products(rolling):
         scene.add_joint(f"joint {k}", *ends, kind="hinge", anchor=grid[other] + [0.05, 0.1, 0], axis=(0, 1, k))
     sim = pctt.Simulation(scene, comm=comm, dt=0.005, say=lambda text: None)
     sim.step()
-    G, random = sim.stepper.system.problem_map, np.random.default_rng(comm.rank)
-    assert comm.allreduce(len(sim.stepper.system.key)) > 30
+    G, random = sim.last.system.problem_map, np.random.default_rng(comm.rank)
+    assert comm.allreduce(len(sim.last.system.key)) > 30
     rows = BlockMap(comm, G.block_rows)
     v, g = random.normal(size=(G.columns, 6)), random.normal(size=(G.rows, 3))
     np.testing.assert_allclose(rows.velocities(v), G.velocities(v), atol=1e-12)
     np.testing.assert_allclose(rows.momenta(g), G.momenta(g), atol=1e-12)
+    y, image, expected = np.zeros_like(g), G.image(), G.velocities(G.momenta(g))
+    G.add_delassus(g, y)
+    np.testing.assert_allclose(y, expected, atol=1e-12)
+    G.find_image(g, image)
+    G.find_velocities(image, np.zeros_like(image), -0.5, np.zeros_like(y), y)
+    np.testing.assert_allclose(2.0 * y, expected, atol=1e-12)
+    energy = comm.allreduce(G.energy_of_step(image, *np.zeros((2, *image.shape)), 0.0))
+    assert energy == pytest.approx(comm.allreduce(float(np.vdot(g, expected))), rel=1e-12)
     away = comm.allreduce(int((np.diff(G.block_rows.indptr) <= 2).sum()))
     assert away > 0  # contacts that see no joint have the blocks of their two bodies
 

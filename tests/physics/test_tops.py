@@ -173,7 +173,7 @@ def test_bodies_get_the_angular_momentum_of_their_impacts():
     begin, given = momenta(), np.zeros((2, 3))
     for _ in range(10):
         sim.step()
-        step = sim.stepper
+        step = sim.last
         given += step.system.contact_map.sums_of_impulses(step.impulse, np.arange(len(step.impulse)))[:, 3:]
     assert np.abs(given).max() > 0.1
     np.testing.assert_allclose(momenta() - begin, given, atol=1e-9)

@@ -106,7 +106,7 @@ def test_bodies_overlap_by_no_more_than_they_do():
     linear = []
     for _ in range(4):
         assert sim.step()["worst_overlap"] < 0.01
-        linear.append(sim.stepper.contacts.linear_gap.min(initial=0.0))
+        linear.append(sim.last.contacts.linear_gap.min(initial=0.0))
     assert min(linear) < -0.05
 
 
