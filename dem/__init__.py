@@ -11,15 +11,13 @@ The loop of a simulation, on any number of ranks::
         advance(world, free, contacts, system.velocity(impulse))
         rebalance(world)
 
-Import from the modules: `dem.scene`, `dem.shapes`, `dem.motion` describe what there is; `dem.start`, `dem.world`,
-`dem.bodies`, `dem.partition` and `dem.neighbourhood` hold it on the ranks; `dem.unconstrained`, `dem.contact`,
-`dem.system` with `dem.contact_map`, `dem.step` and `dem.impulses` are the time step; `dem.experiment` is what the
-program needs of a scene; `dem.record`, `dem.measures` and `dem.analysis` say what steps and runs show. All quantities
-are in SI units.
+The packages, each of which imports those before it alone: `dem.geometry` and `dem.contact_map` know no bodies,
+`dem.shapes`, `dem.parts` and `dem.scene` describe what there is, `dem.measures` asks samples, `dem.model` holds it on
+the ranks, `dem.unconstrained` is the motion without contacts, `dem.contact` finds contacts, `dem.start` begins a run,
+`dem.step` makes a step, and `dem.record` says what it shows. All quantities are in SI units.
 """
 
 __all__ = [
-    "analysis", "bodies", "checks", "contact", "contact_law", "contact_map", "experiment", "impulses", "joints",
-    "loads", "measures", "mesh", "motion", "neighbourhood", "packing", "partition", "record", "scene", "shapes",
-    "sources", "springs", "start", "step", "stiffness", "system", "time_step", "unconstrained", "world",
+    "bodies", "checks", "contact", "contact_map", "experiment", "measures", "mesh", "model", "motion", "packing",
+    "parts", "record", "scene", "shapes", "start", "step", "unconstrained",
 ]  # fmt: skip

@@ -15,7 +15,8 @@ from dem.compiled import loop
 #: meshes are parts of large bodies only.
 SPHERE, BOX, COMPOUND, CAPSULE, PLANE, MESH = range(6)
 
-#: Shapes of grains that a scene describes, its forms (`dem.forms.Form`), are the kinds from here on. Their `size` is
+#: Shapes of grains that a scene describes, its forms (`dem.shapes.forms.Form`), are the kinds from here on. Their
+#: `size` is
 #: alike, so that nothing else needs to know what they are.
 FORM = 6
 

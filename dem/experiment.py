@@ -33,7 +33,7 @@ class Experiment:
     A scene defines `build`, and may define the rest. The attributes may be properties that depend on the options.
     """
 
-    #: Recommended time step [s]; None: `dem.time_step.recommended`.
+    #: Recommended time step [s]; None: `dem.start.time_step.recommended`.
     dt: ClassVar[Any] = None
     #: Recommended contact distance: pairs with smaller gaps are contacts [m]; None: a twentieth of the smallest radius.
     delta: ClassVar[Any] = None

@@ -16,7 +16,7 @@ from dem import bodies
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import SPHERE, Bodies
 from dem.compiled import inlined, loop
-from dem.vectors import cross, dot, plus, shares, turned
+from dem.geometry.vectors import cross, dot, plus, shares, turned
 
 
 def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
@@ -35,7 +35,7 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
 
 def fallen(table: Bodies, gravity: Floats, dt: float) -> tuple[Floats, int]:
     """Velocities (n, 6) after dt [s] under gravity (3,) alone, and how many bodies that forces move are no spheres."""
-    with np.errstate(over="ignore"):  # `dem.neighbourhood` refuses bodies that are lost
+    with np.errstate(over="ignore"):  # `dem.model.neighbourhood` refuses bodies that are lost
         change = dt * gravity
     return falling(table.velocity, table.mass, table.shape, change)
 

@@ -10,10 +10,10 @@ import numpy as np
 from dem import checks
 from dem.arrays import Floats, Rule
 from dem.contact.broad import close_pairs
-from dem.insertion import inserted
-from dem.neighbourhood import image_ways
+from dem.geometry.insertion import inserted
+from dem.model.neighbourhood import image_ways
+from dem.parts.sources import Listed, Uniform
 from dem.quaternion import length
-from dem.sources import Listed, Uniform
 
 SPARSE = 0.1  #: solid fraction up to which spheres are put at random places one after another
 SWELL = 1e-4  #: by how much radii are larger while overlaps are removed, so that none is left

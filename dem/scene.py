@@ -20,20 +20,21 @@ from typing import Any, Union
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies, checks, clumps, contact_law, polyhedra, quaternion, shapes
+from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints, Rule
 from dem.bodies import BOX, CAPSULE, COMPOUND, MESH, PLANE, SPHERE, Bodies
-from dem.contact_law import ContactLaw
-from dem.forms import Form
-from dem.joints import Joint, whole_periods
-from dem.loads import Law, Load, On
+from dem.geometry.survey import Survey, survey
 from dem.measures import Block, Cylinder
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
+from dem.parts import contact_law
+from dem.parts.contact_law import ContactLaw
+from dem.parts.joints import Joint, whole_periods
+from dem.parts.loads import Law, Load, On
+from dem.parts.sources import MOST_IDS, Outlet, Source
+from dem.parts.springs import End, Spring
 from dem.quaternion import across, length
-from dem.shapes import Clump, Shape
-from dem.sources import MOST_IDS, Outlet, Source
-from dem.springs import End, Spring
-from dem.survey import Survey, survey
+from dem.shapes import Clump, Shape, clumps, polyhedra
+from dem.shapes.forms import Form
 
 #: A velocity (3,), or a function of points (n, 3) [m] and outward normals (n, 3) that returns (3,) or (n, 3) [m/s].
 SurfaceVelocity = Union[Sequence[float], Callable[[Floats, Floats], ArrayLike]]
@@ -144,7 +145,7 @@ class Scene:
     ) -> None:
         """`gravity`: (3,) [m/s^2]. `friction` and the `law`, such as `stiffness`, `restitution` or `cohesion`, are the
         coefficients of the contacts of all pairs of materials, but of those of `set_pair`: the fields of
-        `dem.contact_law.ContactLaw`, see docs/contact_laws.md.
+        `dem.parts.contact_law.ContactLaw`, see docs/contact_laws.md.
         `period`: (3,) lengths of the cell, from zero on, that repeats itself along x, y, z [m], None: not along that
         axis. `shear_rate`: d v_x / dy of the cell, or d v_x / dz for the `shear_gradient` "z" [1/s]; None: it is at
         rest. `stress`: (3,) that the cell is to have along x, y, z, positive in compression [Pa]: its periods then
@@ -258,8 +259,8 @@ class Scene:
         """Add solid clumps of spheres of one shape and return their ids (n,).
 
         positions (n, 3) [m] and quaternions (4,) or (n, 4) are those of the frame in which `shape` has its centres.
-        The grains have theirs at the centre of mass along the principal axes, see `dem.clumps`. density [kg/m^3] one
-        for all or (n,); velocities (3,) or (n, 3), the linear one is that of the centre of mass.
+        The grains have theirs at the centre of mass along the principal axes, see `dem.shapes.clumps`. density
+        [kg/m^3] one for all or (n,); velocities (3,) or (n, 3), the linear one is that of the centre of mass.
         """
         form = clumps.form(shape)
         return self._add_form(form, positions, density, 1.0, quaternions, material, velocity, angular_velocity)
@@ -280,7 +281,8 @@ class Scene:
         (n,).
 
         positions (n, 3) [m] and quaternions (4,) or (n, 4) are those of the frame of the vertices, which a grain has
-        times its `scale`. The grains have theirs at the centre of mass along the principal axes, see `dem.polyhedra`.
+        times its `scale`. The grains have theirs at the centre of mass along the principal axes, see
+        `dem.shapes.polyhedra`.
         scale and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3), the linear one is that of the centre
         of mass. ValueError for vertices that are not the corners of a convex solid.
         """
@@ -352,7 +354,8 @@ class Scene:
     ) -> None:
         """Put a force [N] at the centre of mass and a torque [N m] on each of some bodies: a large body or the grains
         of a material by its name, grains by their ids, or all grains. Each is (3,), for ids also (ids, 3), or a
-        function of the time [s] and the table of the bodies, see `dem.loads.Load`. They act from `start` to `end` [s].
+        function of the time [s] and the table of the bodies, see `dem.parts.loads.Load`. They act from `start` to
+        `end` [s].
         """
         if not name or name in self.loads or name in (body.name for body in self.large_bodies):
             raise ValueError(f"loads need names that no other load and no large body has, got {name!r}")
@@ -370,7 +373,7 @@ class Scene:
         anchor: Sequence[float] = (0.0, 0.0, 0.0),
         other_anchor: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Join two bodies, or a body and the world (None), by a spring with a damper, see `dem.springs`.
+        """Join two bodies, or a body and the world (None), by a spring with a damper, see `dem.parts.springs`.
 
         A body is a large body by its name or a grain by its id. The anchors (3,) are in the frames of the bodies, that
         of the world is a place [m]. stiffness [N/m], damping [N s/m], rest `length` [m]: None is the distance at time
@@ -400,7 +403,7 @@ class Scene:
         touching: bool = False,
     ) -> None:
         """Join two bodies, or a body and the world (None), by a "hinge", "slider", "ball" or "fixed" joint, see
-        `dem.joints`.
+        `dem.parts.joints`.
 
         A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,) are in the
         world at time zero, where angle and position are zero; they are those of `other` relative to `one`. A motor
@@ -445,7 +448,7 @@ class Scene:
 
     def add_source(self, name: str, region: Block | Cylinder, *, material: str = "default", **given: Any) -> None:
         """Let grains come in a region of `dem.measures`, where there is room; `given` are the fields of
-        `dem.sources.Source`: radius [m], density [kg/m^3], mass_rate [kg/s] or number_rate [1/s], and others."""
+        `dem.parts.sources.Source`: radius [m], density [kg/m^3], mass_rate [kg/s] or number_rate [1/s], and others."""
         self._refuse_passage(name)
         self.sources[name] = Source(region, material=self._material(material), **given)
 
@@ -506,7 +509,7 @@ class Scene:
 
     def set_pair(self, material: str, other: str, **law: float | None) -> None:
         """Coefficients of the contacts of two materials (which may be the same one), the fields of
-        `dem.contact_law.ContactLaw`; those not given stay as they are. ValueError for a bad one."""
+        `dem.parts.contact_law.ContactLaw`; those not given stay as they are. ValueError for a bad one."""
         one, two = sorted((self._material(material), self._material(other)))
         self._pairs[one, two] = contact_law.law(law, self._pairs.get((one, two), self._law))
 

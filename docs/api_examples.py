@@ -301,7 +301,7 @@ sim = pctt.Simulation(scene, dt=0.005, solver="apgd", tol=1e-8)
 sim.run(until=1.0)
 print("rolls at", round(sim.body("wheel").velocity[0], 4), "m/s: 3 rad/s times 0.2 m")
 
-# %% dem.contact_law.ContactLaw
+# %% dem.parts.contact_law.ContactLaw
 import pctt
 from dem.scene import Scene
 
@@ -313,7 +313,7 @@ world = pctt.Simulation(scene, dt=0.01).world
 print(world.materials)
 print(world.pairs.friction)
 
-# %% dem.loads.Load
+# %% dem.parts.loads.Load
 import pctt
 from dem.scene import Scene
 
@@ -324,7 +324,7 @@ sim = pctt.Simulation(scene, dt=0.01)
 sim.run(until=1.0)
 print("speed", sim.velocities[0, 0], "m/s; impulse over mass", 2.0 * 0.5 / sim.local.mass[0])
 
-# %% dem.springs.Spring
+# %% dem.parts.springs.Spring
 from math import pi, sqrt
 
 import pctt
@@ -339,7 +339,7 @@ sim.run(until=period)
 print(f"after a period of {period:.3f} s it is back at x = {sim.positions[0, 0]:.4f} m")
 print("force of the spring", round(sim.spring_force("spring")[0], 2), "N")
 
-# %% dem.joints.Joint
+# %% dem.parts.joints.Joint
 import pctt
 from dem.motion import Dynamic
 from dem.scene import Scene
@@ -354,7 +354,7 @@ sim.run(until=1.0)
 shoulder = sim.joint("shoulder")
 print(f"angle {shoulder.angle:.3f} rad after 1 s at 0.5 rad/s, torque of the motor {shoulder.drive:.2f} N m")
 
-# %% dem.sources.Source, dem.sources.Outlet, dem.sources.Tally
+# %% dem.parts.sources.Source, dem.parts.sources.Outlet, dem.parts.sources.Tally
 import pctt
 from dem.measures import Block
 from dem.scene import Scene
@@ -367,8 +367,8 @@ sim = pctt.Simulation(scene, dt=0.005, solver="apgd")
 sim.run(until=1.0)
 print(sim.source("feed").count, "came,", sim.outlet("drain").count, "left,", len(sim.ids), "are there")
 
-# %% dem.sources.Uniform, dem.sources.Listed
-from dem.sources import Listed, Uniform
+# %% dem.parts.sources.Uniform, dem.parts.sources.Listed
+from dem.parts.sources import Listed, Uniform
 
 print("between", Uniform(0.01, 0.02).ends)
 sizes = Listed([0.01, 0.03], shares=[0.9, 0.1])  # a tenth of the grains is large
@@ -428,7 +428,7 @@ for name, scene in SCENES.items():
     built = scene().build()
     print(f"{name:12} {len(built.grains()):5} grains; large bodies: {', '.join(b.name for b in built.large_bodies)}")
 
-# %% dem.world.World
+# %% dem.model.world.World
 from mpi4py import MPI
 
 from dem.start import new_world
@@ -437,7 +437,7 @@ from pctt.scenes import Mixer
 world = new_world(Mixer(n=1).build(), MPI.COMM_SELF)
 print(len(world.grains), "grains on this rank,", world.body_count, "bodies in all; time", world.time, "s")
 
-# %% dem.world.Shear
+# %% dem.model.world.Shear
 import pctt
 from dem.scene import Scene
 
@@ -449,7 +449,7 @@ sim.run(until=0.25)
 shear = sim.world.shear
 print("rate", shear.rate, "1/s: the images above are", round(shear.shift, 3), "m further along x")
 
-# %% dem.world.Servo
+# %% dem.model.world.Servo
 import pctt
 from pctt.scenes import PlaneShear
 
@@ -475,17 +475,17 @@ from dem.unconstrained import unconstrained
 free = unconstrained(new_world(Mixer(n=1).build(), MPI.COMM_SELF), dt=0.01)
 print("without contacts a grain falls at", round(free.grains[0, 2], 4), "m/s after", free.dt, "s")
 
-# %% dem.contact.Contacts, dem.system.ContactSystem, dem.step.Step, dem.impulses.ImpulseMemory
+# %% dem.contact.Contacts, dem.step.system.ContactSystem, dem.step.Step, dem.step.impulses.ImpulseMemory
 import numpy as np
 from mpi4py import MPI
 
 from dem.contact import find_contacts
-from dem.impulses import ImpulseMemory
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world
 from dem.step import Step, advance
-from dem.system import ContactSystem
+from dem.step.impulses import ImpulseMemory
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 from pctt import ccp
 
@@ -506,13 +506,13 @@ for _ in range(3):
     print(len(contacts.gap), "contacts, the floor bears", round(-step.force_on("floor")[2], 3), "N")
     advance(world, free, contacts, system.velocity(result.impulse))
 
-# %% dem.contact_map.ContactMap, dem.contact_map.CompactRows, dem.contact_map.Halo, dem.neighbourhood.Neighbourhood
-import numpy as np
+# %% dem.contact_map.ContactMap, dem.contact_map.CompactRows, dem.contact_map.Halo,
+# dem.model.neighbourhood.Neighbourhood import numpy as np
 from mpi4py import MPI
 
 from dem.contact import find_contacts
 from dem.start import new_world
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 from pctt.scenes import Belt
 

@@ -32,13 +32,14 @@ HELPERS = {"integral_problems", "comparison"}  # files that examples import
 PARTS = {
     "Simulations and their results": ["pctt", "pctt.simulation", "pctt.folder", "pctt.analysis", "dem.measures"],
     "What a scene is made of": [
-        "dem.scene", "dem.shapes", "dem.mesh", "dem.motion", "dem.contact_law", "dem.loads", "dem.springs",
-        "dem.joints", "dem.sources", "dem.packing", "dem.experiment", "pctt.scenes", "dem.stiffness", "dem.time_step",
-        "dem.checks", "dem.analysis",
+        "dem.scene", "dem.shapes", "dem.mesh", "dem.motion", "dem.parts.contact_law", "dem.parts.loads",
+        "dem.parts.springs", "dem.parts.joints", "dem.parts.sources", "dem.packing", "dem.experiment", "pctt.scenes",
+        "dem.start.stiffness", "dem.start.time_step", "dem.checks", "dem.record.analysis",
     ],
     "What a time step is made of": [
-        "dem.start", "dem.world", "dem.bodies", "dem.unconstrained", "dem.contact", "dem.system", "dem.contact_map",
-        "dem.step", "dem.impulses", "dem.record", "dem.partition", "dem.neighbourhood",
+        "dem.start", "dem.model.world", "dem.bodies", "dem.unconstrained", "dem.contact", "dem.step.system",
+        "dem.contact_map", "dem.step", "dem.step.impulses", "dem.record", "dem.model.partition",
+        "dem.model.neighbourhood",
     ],
     "Cone problems": ["pctt.ccp", "pctt.ccp.fclib"],
     "Preconditioners and tensor trains": ["pctt.pc", "pctt.mat", "pctt.tt"],
@@ -51,9 +52,9 @@ ONLY = {
     "dem.unconstrained": ["UnconstrainedMotion", "unconstrained"],
     "dem.mesh": ["Mesh"],
     "dem.motion": ["Dynamic", "Fixed", "Glide", "Guided", "Held", "Hinged", "Oscillation", "Path", "Rotation"],
-    "dem.loads": ["Load"],
-    "dem.springs": ["Spring"],
-    "dem.joints": ["Joint"],
+    "dem.parts.loads": ["Load"],
+    "dem.parts.springs": ["Spring"],
+    "dem.parts.joints": ["Joint"],
 }
 
 

@@ -189,7 +189,7 @@ class Table:
     mass: np.ndarray  #: (n,) [kg]
     material: np.ndarray  #: (n,)
     grains: int  #: the first rows
-    forms: Sequence[dict[str, Any]] = ()  #: kinds, and surfaces as of `dem.forms.Form.described`
+    forms: Sequence[dict[str, Any]] = ()  #: kinds, and surfaces as of `dem.shapes.forms.Form.described`
 
     @property
     def radius(self) -> np.ndarray:

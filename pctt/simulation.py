@@ -28,22 +28,22 @@ from dem import measures
 from dem import record as recording
 from dem.arrays import Floats
 from dem.bodies import Bodies
-from dem.changes import change, refuse_functions
 from dem.experiment import Experiment, Given
-from dem.impulses import ImpulseMemory
-from dem.loads import Load
 from dem.measures import Sample
 from dem.mesh import Mesh
+from dem.model.changes import change, refuse_functions
+from dem.model.period import velocity_in_cell, wrapped
 from dem.motion import Motion
-from dem.period import velocity_in_cell, wrapped
+from dem.parts.loads import Load
+from dem.parts.sources import Tally
+from dem.parts.springs import Spring
 from dem.scene import LargeBody, Scene, SurfaceVelocity
-from dem.sources import Tally
-from dem.springs import Spring
 from dem.start import step_remark
+from dem.start.time_step import fall_remark, reason
+from dem.start.turns import TurnWatch
 from dem.step import Step
-from dem.time_step import fall_remark, reason
+from dem.step.impulses import ImpulseMemory
 from dem.together import meet, together
-from dem.turns import TurnWatch
 from pctt import ccp, log
 from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
@@ -67,7 +67,7 @@ class Simulation:
     comm : the communicator
     settings : the `Settings`, with what the scene and the solver have of their own filled in
     experiment : the scene as an `Experiment`
-    world : the bodies of this rank and the time, a `dem.world.World`
+    world : the bodies of this rank and the time, a `dem.model.world.World`
     overlap_watch : what overlaps are to be expected, and what makes the worst, a `pctt.run.overlaps.OverlapWatch`
     dt_reason : what dt was chosen for; empty if it was given
     memory, stepper : the impulses of the last step, and what makes the next, a `pctt.run.stepper.Stepper`
@@ -352,7 +352,7 @@ class Simulation:
             sim.change("cell", stress=(None, None, 2e3))    # stress, strain_rate, shear_rate of a periodic one
 
         The first rank's values count, and checkpoints keep them. ValueError for a name that is not there, and for what
-        it cannot have (`dem.changes.change`)."""
+        it cannot have (`dem.model.changes.change`)."""
         together(self.comm, what, partial(refuse_functions, what, values), own=(ValueError,))
         values = self.comm.bcast(values)
         together(self.comm, what, partial(change, self.world, what, **values), own=(ValueError, TypeError))

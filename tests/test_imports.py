@@ -47,7 +47,22 @@ def graph():
 
 def test_no_module_imports_itself_in_a_circle(graph):
     order = list(TopologicalSorter(graph).static_order())  # a CycleError names the circle
-    assert order.index("dem.world") < order.index("dem.contact") < order.index("dem.start")
+    assert order.index("dem.model.world") < order.index("dem.contact") < order.index("dem.start")
+
+
+#: The packages of dem, each above those before it; what lies flat in dem is below them or a door to them.
+PACKAGES = (
+    "geometry", "contact_map", "shapes", "measures", "parts", "model", "unconstrained", "contact", "start", "step",
+    "record",
+)  # fmt: skip
+
+
+def test_a_package_of_dem_imports_those_below_it_alone(graph):
+    floor = {f"dem.{name}": n for n, name in enumerate(PACKAGES)}
+    for name, others in graph.items():
+        for other in others:
+            here, there = (floor.get(".".join(each.split(".")[:2])) for each in (name, other))
+            assert here is None or there is None or there <= here, f"{name} imports {other}"
 
 
 #: The parts of the house, each with those whose modules it may import.
@@ -57,7 +72,7 @@ BELOW = {
     "dem.contact_map": {"dem.arrays", "dem.compiled", "dem.exchange"},
     "pctt.body_matrix": {"pctt.blocks", "dem.contact_map", "dem.exchange"},
     "pctt.mat": {
-        "pctt.disk", "dem.exchange", "dem.morton", "pctt.options", "pctt.petsc",
+        "pctt.disk", "dem.exchange", "dem.geometry.morton", "pctt.options", "pctt.petsc",
         "pctt.tt",
     },
     "pctt.folder": {"dem", "pctt.disk"},
@@ -68,7 +83,7 @@ BELOW = {
 
 
 #: What the parts above dem may use of it, though they know of no scene.
-SHARED = ("dem.compiled", "dem.contact_map", "dem.exchange", "dem.morton")
+SHARED = ("dem.compiled", "dem.contact_map", "dem.exchange", "dem.geometry.morton")
 
 
 def within(name, part):

@@ -35,7 +35,7 @@ from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, CAPSULE, CLUMP, MESH, PLANE, POLYHEDRON, SPHERE
 from dem.compiled import inlined, loop
 from dem.contact.spheres import frame_of, to_box
-from dem.vectors import cross, dot, plus, shares, turned
+from dem.geometry.vectors import cross, dot, plus, shares, turned
 
 #: Radii (half thicknesses) by which a body is moved ahead along another one, at most: its impulses may stop it sooner.
 FURTHEST = 0.25

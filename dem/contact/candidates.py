@@ -10,9 +10,9 @@ from dem.bodies import BOX, MESH, PLANE
 from dem.compiled import loop
 from dem.contact.lists import Lists, Rows
 from dem.contact.primitives import Primitives
-from dem.neighbourhood import Neighbourhood
+from dem.model.neighbourhood import Neighbourhood
+from dem.model.world import World
 from dem.quaternion import cross, length
-from dem.world import World
 
 #: Rows i, j (m,) of `Primitives`, of which i has the lower number, and the gaps (m,) within which their margins meet.
 Pairs = tuple[Ints, Ints, Floats]

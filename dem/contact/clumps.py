@@ -10,9 +10,9 @@ import numpy as np
 from dem import quaternion
 from dem.arrays import Floats, Ints
 from dem.bodies import CLUMP, PLANE, POLYHEDRON, Bodies
-from dem.clumps import ClumpForm
 from dem.compiled import inlined, loop
-from dem.forms import Form
+from dem.shapes.clumps import ClumpForm
+from dem.shapes.forms import Form
 
 
 class Members(NamedTuple):

@@ -19,9 +19,9 @@ from dem.contact.broad import close_pairs
 from dem.contact.primitives import Primitives, primitives
 from dem.contact_map import Halo
 from dem.exchange import on_any
-from dem.neighbourhood import Neighbourhood, neighbourhood
-from dem.period import Images, between, images
-from dem.world import World
+from dem.model.neighbourhood import Neighbourhood, neighbourhood
+from dem.model.period import Images, between, images
+from dem.model.world import World
 
 #: The slack of a grain at rest, as a part of its radius. In a mixer lists of 0.2 and 8 have a fifth more pairs than
 #: those of 0.1 and 4, and are made half as often: a search takes 5 % less.

@@ -23,9 +23,9 @@ import numpy as np
 from dem.arrays import Floats, Ints
 from dem.compiled import loop
 from dem.contact.narrow import CORNERS, Manifold, Planes, Spheres, Touch
-from dem.forms import Form
-from dem.polyhedra import Faces, Solid, hull
-from dem.vectors import dot
+from dem.geometry.vectors import dot
+from dem.shapes.forms import Form
+from dem.shapes.polyhedra import Faces, Solid, hull
 
 #: Polyhedra touch on faces if the smallest gap there is within this share of the contact distance of their distance; if
 #: not, in the closest points alone.
@@ -50,7 +50,7 @@ PARALLEL = 1e-5
 
 
 class Hulls(NamedTuple):
-    """The different polyhedra of a scene, `dem.polyhedra.Faces` of each in rows of the same lengths."""
+    """The different polyhedra of a scene, `dem.shapes.polyhedra.Faces` of each in rows of the same lengths."""
 
     radius: Floats  #: (h,) of the spheres about their origins that enclose them
     inner: Floats  #: (h,) of the spheres about their origins within them, over `radius`

@@ -37,12 +37,12 @@ from dem.contact.polyhedra import (
     spheres_polyhedra,
 )
 from dem.contact.spheres import touch_spheres
-from dem.forms import Form
 from dem.mesh import Mesh, Surface
+from dem.model.neighbourhood import Neighbourhood
 from dem.motion import Dynamic
-from dem.neighbourhood import Neighbourhood
 from dem.scene import LargeBody
 from dem.shapes import Shape, placed
+from dem.shapes.forms import Form
 
 
 class Primitives(NamedTuple):

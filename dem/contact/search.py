@@ -15,12 +15,12 @@ from dem.contact.ahead import Course
 from dem.contact.candidates import meeting
 from dem.contact.lists import Lists, grain_lists
 from dem.contact.primitives import extents, touches, touches_ahead
-from dem.drives import free_directions, free_turns
-from dem.neighbourhood import Neighbourhood, refreshed
-from dem.period import Images, refuse_short
+from dem.model.neighbourhood import Neighbourhood, refreshed
+from dem.model.period import Images, refuse_short
+from dem.model.world import World
 from dem.quaternion import cross, length
 from dem.unconstrained import UnconstrainedMotion
-from dem.world import World
+from dem.unconstrained.drives import free_directions, free_turns
 
 #: Margin of a grain over the way that it goes in a step without contact forces: those that push it on often add a part.
 FURTHER = 1.25
@@ -54,7 +54,7 @@ class Contacts:
     #: with these arms, as bodies turn; None: nothing [m/s]
     swing: Floats | None = None
     drift: Floats | None = None  #: (nc, 3) what the shear adds to the velocity of b relative to a; None: nothing [m/s]
-    #: (nc,) the normal velocities after impacts that `dem.impacts` follows; -inf where two do not meet, NaN where
+    #: (nc,) the normal velocities after impacts that `dem.step.impacts` follows; -inf where two do not meet, NaN where
     #: nothing is followed; None: nowhere [m/s]
     parting: Floats | None = None
     #: (grains, 3) by how much grains end beside the place to which their velocities after the step would bring them, as

@@ -14,9 +14,9 @@ import numpy as np
 from dem.arrays import Floats
 from dem.experiment import Experiment, option
 from dem.measures import Block
+from dem.parts.sources import Uniform
 from dem.scene import Scene
 from dem.shapes import Box
-from dem.sources import Uniform
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ class ConeProblem:
     """A cone problem is that of one step, with its contacts distributed over the ranks of ``comm``.
 
     N = G M^-1 G' + C is given by the map G from velocities of unknowns to those of contacts, with the masses M of the
-    unknowns, or directly (``N``). The compliance C is diagonal: contacts that yield a little, see `dem.stiffness`.
-    Arrays and scipy matrices are the rows of this rank's contacts, with the columns of all.
+    unknowns, or directly (``N``). The compliance C is diagonal: contacts that yield a little, see
+    `dem.start.stiffness`. Arrays and scipy matrices are the rows of this rank's contacts, with the columns of all.
 
     r : (nc, 3) velocities of the contacts without impulses, plus gap/dt (m/s); (nc, 2) for contacts of the plane, whose
         N and G have two rows for each, of the normal and of the tangent

@@ -22,7 +22,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem.morton import morton_codes
+from dem.geometry.morton import morton_codes
 from pctt.mat.entries import given
 from pctt.tt.quantise import GridDigits
 from pctt.tt.train import Array

@@ -20,7 +20,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem.morton import Frame, morton_codes
+from dem.geometry.morton import Frame, morton_codes
 from pctt.blocks import inverse_diagonal_blocks
 from pctt.mat.grid_train import TrainProduct
 from pctt.mat.order import Places, chosen_order

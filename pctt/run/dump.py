@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from dem.contact_law import ContactLaw
 from dem.contact_map import ContactMap, root_blocks
 from dem.contact_map.rows import packed
 from dem.exchange import offsets
 from dem.experiment import Experiment
-from dem.joints import Joint
-from dem.system import ContactSystem
-from dem.world import World
+from dem.model.world import World
+from dem.parts.contact_law import ContactLaw
+from dem.parts.joints import Joint
+from dem.step.system import ContactSystem
 from pctt import ccp
 from pctt.ccp import fclib
 from pctt.ccp.cones import Array

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from dem.arrays import Floats
-from dem.joints import HOLDS, Geometry, Joint
+from dem.parts.joints import HOLDS, Geometry, Joint
 from dem.together import meet
 from dem.unconstrained import joints_now
 

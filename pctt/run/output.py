@@ -24,13 +24,13 @@ from mpi4py import MPI
 from dem import bodies
 from dem.exchange import exchange
 from dem.experiment import Experiment
+from dem.model.period import lattice, velocity_in_cell, wrapped
+from dem.model.world import World
 from dem.motion import Dynamic
-from dem.period import lattice, velocity_in_cell, wrapped
 from dem.scene import least_half
 from dem.shapes import described
 from dem.step import Step
 from dem.together import together
-from dem.world import World
 from pctt import disk
 from pctt.disk import FileError, Lock, on_first, texts, write_rows, write_text
 from pctt.folder import DERIVED, FILES, HARD, PLACES, TABLE, Folder, dumps, write_table

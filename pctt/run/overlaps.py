@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from dem.overlaps import overlaps
 from dem.scene import Scene, least_half
+from dem.start.stiffness import expected_overlap
+from dem.start.time_step import DRIVEN, smallest
 from dem.step import Step
-from dem.stiffness import expected_overlap
-from dem.time_step import DRIVEN, smallest
+from dem.step.overlaps import overlaps
 from pctt.run.report import mending
 from pctt.run.settings import CLOSING, Settings
 

@@ -19,9 +19,9 @@ from dem import bodies
 from dem.arrays import Floats
 from dem.compiled import loop
 from dem.exchange import reduced
+from dem.model.world import World
 from dem.record import energy
-from dem.system import ContactSystem
-from dem.world import World
+from dem.step.system import ContactSystem
 from pctt.ccp import Limits, Result
 
 SLOW = 0.3  #: kinetic energy of bodies at rest, over that of a step of free fall: loose steps shake them by 0.2

@@ -10,9 +10,9 @@ from typing import Any, Optional
 
 import numpy as np
 
-from dem import time_step
 from dem.experiment import SCENE_FILE, Experiment, Given, SceneFileError, from_file
 from dem.scene import Scene
+from dem.start import time_step
 from pctt import ccp
 from pctt.ccp.registry import why_no_form, why_refused
 from pctt.options import (

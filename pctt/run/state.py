@@ -17,20 +17,19 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from dem import stiffness, time_step
 from dem.arrays import Floats
 from dem.bodies import Bodies
-from dem.changes import changes, restore
 from dem.exchange import refuse
 from dem.experiment import Experiment
-from dem.impulses import ImpulseMemory
 from dem.mesh import Mesh
+from dem.model.changes import changes, restore
+from dem.model.world import World
 from dem.quaternion import cross
 from dem.scene import LargeBody, Scene
 from dem.shapes import placed
-from dem.start import even_slice, new_world, restart_rows, restored_world
+from dem.start import even_slice, new_world, restart_rows, restored_world, stiffness, time_step
+from dem.step.impulses import ImpulseMemory
 from dem.together import SceneError, together, unlike
-from dem.world import World
 from pctt import ccp
 from pctt.disk import FileError, Lock, on_first, read, same_rows, texts, write_rows
 from pctt.options import OptionError

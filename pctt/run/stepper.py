@@ -13,17 +13,17 @@ from mpi4py import MPI
 from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
 from dem.exchange import reduced
-from dem.fast import refuse_passages
-from dem.impacts import in_order
-from dem.impulses import ImpulseMemory
-from dem.partition import rebalance
-from dem.passage import come_and_go
-from dem.period import put_back
+from dem.model.partition import rebalance
+from dem.model.period import put_back
+from dem.model.world import World
+from dem.record.passage import come_and_go
 from dem.step import Step, advance, carried, find_overrun, find_turned
-from dem.system import ContactSystem, contact_frames
+from dem.step.fast import refuse_passages
+from dem.step.impacts import in_order
+from dem.step.impulses import ImpulseMemory
+from dem.step.system import ContactSystem, contact_frames
 from dem.together import SceneError
 from dem.unconstrained import unconstrained
-from dem.world import World
 from pctt import ccp, log
 from pctt.ccp.cones import Array, Cones
 from pctt.options import OptionError

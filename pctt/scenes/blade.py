@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dem import analysis
 from dem.arrays import Corners, Floats, Rule
 from dem.checks import not_negative, positive
 from dem.experiment import option
 from dem.packing import perturbed
+from dem.record import analysis
 from dem.scene import Scene
 from dem.shapes import Box
 from dem.step import Step

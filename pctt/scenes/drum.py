@@ -8,13 +8,13 @@ from math import atan2, ceil, degrees, pi, sin, sqrt
 
 import numpy as np
 
-from dem.analysis import calm
 from dem.arrays import Corners, Floats, Rule
 from dem.checks import between, not_negative, positive
 from dem.experiment import option
 from dem.mesh import Mesh
 from dem.motion import Rotation
 from dem.packing import uniform
+from dem.record.analysis import calm
 from dem.scene import Scene
 from dem.step import Step
 from pctt.scenes.lattice import SmallSpheres, rest_after_fall

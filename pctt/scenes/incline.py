@@ -9,12 +9,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from dem.analysis import calm
 from dem.arrays import Floats
 from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
 from dem.measures import Block, solid_fraction
 from dem.packing import perturbed
+from dem.record.analysis import calm
 from dem.scene import Scene
 from dem.shapes import Plane, Sphere
 from dem.step import Step

@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dem.analysis import calm
 from dem.arrays import Bools, Floats, Ints, Rule
 from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
 from dem.motion import Oscillation
 from dem.packing import perturbed
 from dem.quaternion import length
+from dem.record.analysis import calm
 from dem.scene import Scene
 from dem.shapes import Plane, Shape
 

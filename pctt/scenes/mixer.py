@@ -8,12 +8,12 @@ from math import inf, isinf, pi, sqrt
 
 import numpy as np
 
-from dem import analysis
 from dem.arrays import Corners, Floats, Rule
 from dem.checks import not_negative, positive, positive_or_inf
 from dem.experiment import option
 from dem.motion import Hinged, Rotation
 from dem.packing import perturbed
+from dem.record import analysis
 from dem.scene import Scene
 from dem.shapes import Box
 from pctt.scenes.lattice import LargeSpheres

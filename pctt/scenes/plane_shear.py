@@ -9,16 +9,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from dem.analysis import calm
 from dem.arrays import Floats
 from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
 from dem.packing import perturbed, random_packing
+from dem.parts.sources import Uniform
 from dem.record import cell
+from dem.record.analysis import calm
 from dem.scene import Scene
-from dem.sources import Uniform
+from dem.start.time_step import PASSING, SHEARED
 from dem.step import Step
-from dem.time_step import PASSING, SHEARED
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from math import pi
 
 import numpy as np
 
-from dem import analysis
 from dem.arrays import Corners, Floats, Rule
 from dem.checks import between, not_negative, positive
 from dem.experiment import option
 from dem.motion import Guided
 from dem.packing import perturbed
+from dem.record import analysis
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Shape
 from dem.step import Step

@@ -8,7 +8,6 @@ from math import ceil, pi, sqrt
 
 import numpy as np
 
-from dem.analysis import calm
 from dem.arrays import Corners, Floats, Rule
 from dem.checks import between, finite, not_negative, positive
 from dem.experiment import option
@@ -16,6 +15,7 @@ from dem.mesh import Mesh
 from dem.motion import Held
 from dem.packing import perturbed
 from dem.quaternion import exponential
+from dem.record.analysis import calm
 from dem.scene import Scene
 from dem.shapes import Box, Shape
 from dem.step import Step

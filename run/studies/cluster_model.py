@@ -20,13 +20,14 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from shared import Row, markdown, next_problem, settled
 
-from dem import bodies, neighbourhood
+from dem import bodies
 from dem.contact import Contacts, find_contacts
 from dem.contact_map.halo import Halo, Messages
-from dem.morton import morton_codes
-from dem.partition import frame_of_most, redistribute, splitters
+from dem.geometry.morton import morton_codes
+from dem.model import neighbourhood
+from dem.model.partition import frame_of_most, redistribute, splitters
+from dem.model.world import World
 from dem.unconstrained import unconstrained
-from dem.world import World
 from pctt import ccp
 from pctt.ccp.newton.multifrontal import MultifrontalFactors
 from pctt.scenes import Mixer
@@ -36,7 +37,7 @@ BOXES = 8 * 6 * 8  # bytes of the boxes of a rank
 SIZES = {8: (4_915, 18_300), 16: (35_939, 137_700), 32: (274_627, 1_150_000)}  # bodies, contacts of settled mixers
 MODEL = (1, 2, 4, 16, 64, 256, 1024)  # ranks
 SHARE = 100_000  # contacts of a rank where the problem grows with the ranks
-LOAD = 1.05  # of the rank with the most, over the mean: the curve is cut again above (`dem.partition.rebalance`)
+LOAD = 1.05  # of the rank with the most, over the mean: the curve is cut again above (`dem.model.partition.rebalance`)
 OUTSIDE = 22  # collective calls of a step outside of the solve (tests/run/test_collectives.py)
 FEW = 30  # bodies of a piece, on average, at least
 STEPS = 12  # that are measured, after 3
@@ -50,7 +51,7 @@ def pieces(world: World, body: np.ndarray, ranks: int) -> dict[str, np.ndarray]:
     """What each of so many ranks (ranks,) has after a cut of the curve: contacts, bodies, ghosts, the messages that it
     sends in a product, and the numbers of bodies in them.
 
-    world : on one rank, its grains in the order of the curve (`dem.partition.redistribute`), searched
+    world : on one rank, its grains in the order of the curve (`dem.model.partition.redistribute`), searched
     body : (nc, 2) global indices of the bodies of the contacts; -1 for a body that no impulse moves
     """
     owner = owners(world, ranks)

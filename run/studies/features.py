@@ -115,17 +115,18 @@ class Feature(NamedTuple):
 
 
 FEATURES = {
-    "loads": Feature(bed, loaded, ("dem/loads.py",)),
-    "springs": Feature(with_body, lambda: with_body("spring"), ("dem/springs.py",)),
-    "joints": Feature(with_body, lambda: with_body("joint"), ("dem/joints.py", "contact_map/mass.py")),
-    "sources": Feature(bed, rained, ("dem/sources.py", "dem/passage.py", "dem/insertion.py")),
-    "outlets": Feature(bed, drained, ("dem/sources.py", "dem/passage.py")),
-    "clumps": Feature(bed, lambda: bed(clumps=True), ("contact/clumps.py", "dem/clumps.py")),
-    "periodic": Feature(bed, lambda: bed(walls=False), ("dem/period.py",)),
+    "loads": Feature(bed, loaded, ("dem/parts/loads.py",)),
+    "springs": Feature(with_body, lambda: with_body("spring"), ("dem/parts/springs.py",)),
+    "joints": Feature(with_body, lambda: with_body("joint"), ("dem/parts/joints.py", "contact_map/mass.py")),
+    "sources": Feature(bed, rained, ("dem/parts/sources.py", "dem/record/passage.py", "dem/geometry/insertion.py")),
+    "outlets": Feature(bed, drained, ("dem/parts/sources.py", "dem/record/passage.py")),
+    "clumps": Feature(bed, lambda: bed(clumps=True), ("contact/clumps.py", "dem/shapes/clumps.py")),
+    "periodic": Feature(bed, lambda: bed(walls=False), ("dem/model/period.py",)),
     "shear": Feature(lambda: flow(at_rest=True), flow, ()),
-    "servo": Feature(lambda: flow(constant=True), flow, ("contact_map/mass.py", "dem/servo.py")),
-    "rolling": Feature(bed, lambda: bed(rolling=5e-4, spinning=1e-4), ("dem/rolling.py", "contact_map/turning.py")),
-    "cohesion": Feature(bed, lambda: bed(cohesion=1e-3, cohesion_range=1e-4), ("dem/cohesion.py",)),
+    "servo": Feature(lambda: flow(constant=True), flow, ("contact_map/mass.py", "dem/step/servo.py")),
+    "rolling": Feature(bed, lambda: bed(rolling=5e-4, spinning=1e-4), ("dem/step/rolling.py",
+    "contact_map/turning.py")),
+    "cohesion": Feature(bed, lambda: bed(cohesion=1e-3, cohesion_range=1e-4), ("dem/step/cohesion.py",)),
     "restitution": Feature(bed, lambda: bed(restitution=0.5), ("_bounce",)),
     "measures": Feature(bed, bed, ("dem/measures",), measured),
 }

@@ -28,7 +28,7 @@ from newton_systems import COMM, FORMS, Replay, System, replays
 from petsc4py import PETSc
 from shared import ROOT, Row, Table, figure, listed, parser, record, reduce_colours, say_machine
 
-from dem.morton import morton_codes
+from dem.geometry.morton import morton_codes
 from pctt.tt.train import decompose
 
 BONDS = (8, 64, 512)  # contacts in a box

@@ -214,7 +214,7 @@ def settled(scene: Any, seed: int | None = None, moved: float = 0.0, **settings:
 def next_problem(sim: Any, contacts: Any = None) -> Any:
     """The `pctt.ccp.ConeProblem` of the next step of a simulation, of these contacts if they are known."""
     from dem.contact import find_contacts
-    from dem.system import ContactSystem
+    from dem.step.system import ContactSystem
     from dem.unconstrained import unconstrained
     from pctt.run.stepper import cone_problem
 

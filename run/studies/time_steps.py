@@ -36,7 +36,7 @@ import shared
 from shared import Row, Table, settings_of, settled
 
 from dem.experiment import Experiment
-from dem.time_step import recommended
+from dem.start.time_step import recommended
 from dem.together import SceneError
 from pctt.scenes import Blade, Drum, Mixer, Shear, Silo
 

@@ -9,13 +9,13 @@ from dem import quaternion
 from dem.arrays import Floats
 from dem.bodies import Bodies
 from dem.contact import Contacts, find_contacts
+from dem.model.world import World
 from dem.motion import Dynamic, Oscillation, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
 from dem.step import advance
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
-from dem.world import World
 
 
 def force_on(world: World, system: ContactSystem, name: str, impulse: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dem import analysis
+from dem.record import analysis
 from pctt.scenes import Blade, Shear
 
 TIME = np.arange(0.0, 8.0, 0.01)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dem.changes import change, changes, restore
 from dem.measures import Block
+from dem.model.changes import change, changes, restore
 from dem.motion import Dynamic, Glide
 from dem.scene import Scene
 from dem.shapes import Box, Sphere

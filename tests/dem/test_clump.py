@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dem import clumps, quaternion
+from dem import quaternion
 from dem.bodies import CLUMP
 from dem.contact import find_contacts
 from dem.free_motion import free_velocity
 from dem.measures import Block, solid_fraction
 from dem.scene import Scene
-from dem.shapes import Clump, Plane
+from dem.shapes import Clump, Plane, clumps
 from dem.start import new_world
 from pctt.simulation import Simulation
 

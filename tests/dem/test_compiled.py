@@ -23,7 +23,7 @@ from dem.contact import broad
 from dem.contact.narrow import Spheres, sphere_sphere
 from dem.contact.spheres import touch_spheres
 from dem.free_motion import free_spin
-from dem.system import contact_frames
+from dem.step.system import contact_frames
 
 
 def sorted_rows(pairs):

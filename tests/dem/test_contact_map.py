@@ -14,7 +14,7 @@ from dem.motion import Dynamic, Guided, Oscillation
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
 

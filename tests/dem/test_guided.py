@@ -13,7 +13,7 @@ from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
 from dem.step import advance
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF

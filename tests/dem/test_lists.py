@@ -11,13 +11,13 @@ from cases import crude_impulse, heap
 from mpi4py import MPI
 
 from dem.contact import find_contacts
+from dem.model.partition import rebalance
 from dem.motion import Hinged, Rotation
-from dem.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Box, Mesh, Plane
 from dem.start import new_world, restored_world
 from dem.step import advance
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
 DT = 0.005

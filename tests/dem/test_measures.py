@@ -14,10 +14,10 @@ from dem import measures
 from dem.contact import find_contacts
 from dem.measures import Block, Cylinder, Sample
 from dem.mesh import Mesh
-from dem.partition import rebalance
+from dem.model.partition import rebalance
 from dem.start import new_world
 from dem.step import Step
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF

@@ -13,10 +13,10 @@ import pctt
 from dem import measures
 from dem.measures import Block, Cylinder, Sample
 from dem.mesh import Mesh
+from dem.model.period import lattice
+from dem.model.world import Shear
 from dem.packing import random_packing
-from dem.period import lattice
 from dem.scene import Scene
-from dem.world import Shear
 from pctt import analysis
 from pctt.folder import Folder
 

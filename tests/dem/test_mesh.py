@@ -19,7 +19,7 @@ from dem.motion import Dynamic, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere, mass_properties, moved
 from dem.start import new_world
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 from pctt import ccp
 from pctt.run.stepper import cone_problem

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 
 from dem import quaternion
-from dem.changes import changes, restore
+from dem.model.changes import changes, restore
 from dem.motion import Fixed, Glide, Guided, Oscillation, Path, Rotation, checked_pose, mean_velocity, refuse_ignored
 from dem.scene import Scene
 from dem.shapes import Box

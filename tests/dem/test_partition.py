@@ -7,8 +7,8 @@ from mpi4py import MPI
 
 from dem.bodies import Bodies
 from dem.contact import find_contacts
-from dem.morton import Frame, morton_codes
-from dem.partition import imbalance, rebalance, splitters
+from dem.geometry.morton import Frame, morton_codes
+from dem.model.partition import imbalance, rebalance, splitters
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world

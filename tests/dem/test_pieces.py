@@ -8,9 +8,9 @@ from cluster_model import moving, pieces
 from mpi4py import MPI
 
 from dem.contact import find_contacts
-from dem.partition import redistribute
+from dem.model.partition import redistribute
 from dem.start import new_world
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
 

@@ -13,9 +13,9 @@ from dem.bodies import POLYHEDRON
 from dem.contact import find_contacts
 from dem.contact.narrow import CORNERS, Spheres
 from dem.contact.polyhedra import FLUSH, ROUND, SNAP, Polyhedra, hulls_of, polyhedra_polyhedra, spheres_polyhedra
-from dem.polyhedra import solid
 from dem.scene import Scene
 from dem.shapes import Box, Plane
+from dem.shapes.polyhedra import solid
 from dem.start import new_world
 
 TETRAHEDRON = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / 3**0.5

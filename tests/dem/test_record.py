@@ -14,13 +14,13 @@ from dem import record
 from dem.bodies import COMPOUND
 from dem.contact import find_contacts
 from dem.experiment import Experiment
+from dem.model.partition import rebalance
 from dem.motion import Glide, Guided, Hinged
-from dem.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Plane, Sphere
 from dem.start import new_world
 from dem.step import advance
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF

@@ -15,8 +15,8 @@ from dem.packing import perturbed
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
 from dem.start import new_world
-from dem.stiffness import pairs
-from dem.time_step import fastest, smallest
+from dem.start.stiffness import pairs
+from dem.start.time_step import fastest, smallest
 from pctt.scenes import Mixer
 
 SELF = MPI.COMM_SELF

@@ -19,7 +19,7 @@ from dem.motion import Dynamic, Fixed, Glide
 from dem.scene import Scene
 from dem.shapes import Box, Capsule, Plane, Sphere
 from dem.start import new_world
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF

@@ -15,7 +15,7 @@ from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere, mass_properties
 from dem.start import new_world
 from dem.step import advance
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 from pctt import Simulation, ccp
 from pctt.run.stepper import cone_problem

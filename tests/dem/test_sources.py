@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from dem.insertion import inserted
+from dem.geometry.insertion import inserted
 from dem.measures import Block, Cylinder
+from dem.parts.sources import Listed, Source, Tally, Uniform, bounds, numbers, points, reach
 from dem.scene import Scene
 from dem.shapes import Box, Capsule
-from dem.sources import Listed, Source, Tally, Uniform, bounds, numbers, points, reach
 
 BLOCK = Block((0, 0, 0), (1, 2, 3))
 TUBE = Cylinder((1, 1, 1), (2, 3, 0), 0.5)

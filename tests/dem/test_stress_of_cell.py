@@ -7,8 +7,8 @@ from mpi4py import MPI
 import pctt
 from dem.contact_map.mass import CellMass, InverseMass
 from dem.scene import Scene
-from dem.servo import CLOSING, KEPT, LEADING
 from dem.shapes import Plane
+from dem.step.servo import CLOSING, KEPT, LEADING
 from pctt.ccp.delassus import BlockMap
 from pctt.scenes import PlaneShear
 

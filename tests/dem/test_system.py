@@ -12,7 +12,7 @@ from dem.contact import find_contacts
 from dem.scene import Scene
 from dem.start import new_world
 from dem.step import advance
-from dem.system import ContactSystem, contact_frames
+from dem.step.system import ContactSystem, contact_frames
 from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF

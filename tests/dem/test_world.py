@@ -10,12 +10,12 @@ from several_ranks import alone
 
 from dem import bodies
 from dem.contact import find_contacts
-from dem.partition import rebalance
+from dem.model.partition import rebalance
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world, restored_world
 from dem.step import advance
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF

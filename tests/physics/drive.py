@@ -14,14 +14,14 @@ from mpi4py import MPI
 import dem.step
 from dem.arrays import Floats
 from dem.contact import find_contacts
-from dem.partition import rebalance
+from dem.model.partition import rebalance
+from dem.model.world import World
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world
 from dem.step import advance
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
-from dem.world import World
 from pctt import ccp
 from pctt.run.stepper import cone_problem
 

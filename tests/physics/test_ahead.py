@@ -9,16 +9,16 @@ from mpi4py import MPI
 
 import pctt
 from dem.bodies import POLYHEDRON
-from dem.clumps import Clump
 from dem.contact import find_contacts
 from dem.contact.narrow import CORNERS
 from dem.mesh import Mesh
 from dem.motion import Glide, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
+from dem.shapes.clumps import Clump
 from dem.start import new_world
 from dem.step import advanced
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
 DENSITY = 2500.0

@@ -12,8 +12,8 @@ import pctt
 from dem.motion import Dynamic, Guided
 from dem.scene import Scene
 from dem.shapes import Box, Plane
-from dem.stiffness import recommended
-from dem.time_step import recommended as recommended_step
+from dem.start.stiffness import recommended
+from dem.start.time_step import recommended as recommended_step
 from pctt.scenes import Mixer
 
 FLAT = (np.cos(np.pi / 4), 0.0, np.sin(np.pi / 4), 0.0)

@@ -7,11 +7,11 @@ import pytest
 from drive import G, on_incline, steps
 from mpi4py import MPI
 
+from dem.model.world import World
 from dem.motion import Rotation
 from dem.scene import Scene
 from dem.shapes import Box
 from dem.start import new_world
-from dem.world import World
 from pctt import ccp
 
 

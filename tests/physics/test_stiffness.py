@@ -9,7 +9,16 @@ import pctt
 from dem.motion import Glide, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Plane
-from dem.stiffness import DAMPING, RESISTS, STOPPED, compliance, expected_overlap, of_youngs_modulus, pairs, recommended
+from dem.start.stiffness import (
+    DAMPING,
+    RESISTS,
+    STOPPED,
+    compliance,
+    expected_overlap,
+    of_youngs_modulus,
+    pairs,
+    recommended,
+)
 from pctt import ccp
 from pctt.scenes import Mixer
 

@@ -13,7 +13,7 @@ from dem import quaternion
 from dem.motion import Dynamic
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
-from dem.time_step import recommended
+from dem.start.time_step import recommended
 from pctt.simulation import Simulation
 
 G, ARM = 9.81, 0.1

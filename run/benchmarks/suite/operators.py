@@ -8,7 +8,7 @@ import numpy as np
 from shared import next_problem, settled
 
 from dem.contact import find_contacts
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 from pctt import ccp
 from pctt.body_matrix import BodyOperator

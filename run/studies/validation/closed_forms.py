@@ -10,13 +10,13 @@ from validation.rows import Row, row
 
 from dem.contact import find_contacts
 from dem.mesh import Mesh
+from dem.model.world import World
 from dem.scene import Scene
 from dem.shapes import Plane, Shape
 from dem.start import new_world
 from dem.step import advance
-from dem.system import ContactSystem
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
-from dem.world import World
 from pctt import ccp
 from pctt.run.stepper import cone_problem
 from pctt.simulation import Simulation

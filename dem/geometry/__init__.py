@@ -1,0 +1,1 @@
+"""Vectors, curves and places that no mechanics is in."""

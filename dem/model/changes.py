@@ -1,0 +1,224 @@
+"""What a run changes of the world: loads, springs, joints, sources, motions and surfaces of large bodies, and the cell.
+
+All ranks call these functions alike, with the same arguments. Checkpoints keep the changes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dem import checks, quaternion
+from dem import motion as motions
+from dem.arrays import Floats
+from dem.checks import nearest
+from dem.model.world import World
+from dem.motion import Dynamic, Motion, Pose, Prescribed, checked_pose
+from dem.parts.loads import Load
+from dem.parts.named import Named
+from dem.scene import LargeBody, checked_surface
+
+#: The fields of a `World` that have parts by their names, by what a part is called.
+PARTS = {"load": "loads", "spring": "springs", "joint": "joints", "source": "sources"}
+KINDS = (*PARTS, "body", "cell")
+
+
+def change(world: World, what: str, **values: Any) -> None:
+    """Give a part other values from now on. ValueError for what is not there, and for values that it cannot have.
+
+    `what` is a kind and a name: "load wind", "spring tie", "joint axle", "source rain" with values of the class's
+    `CHANGED`; "body belt" with `motion`, or parameters of its present one, and `surface_velocity`; or "cell" with
+    `shear_rate`, `stress` and `strain_rate`. A load that is not there begins, if `on` is among the values.
+    """
+    kind, _, name = what.partition(" ")
+    if kind not in KINDS:
+        raise ValueError(f"{what!r}: allowed are {', '.join(KINDS[:-1])} with a name, and cell" + nearest(kind, KINDS))
+    refuse_functions(what, values)
+    if kind == "cell":
+        _change_cell(world, **values)
+    elif kind == "body":
+        _change_body(world, name, **values)
+    else:
+        _change_part(world, kind, name, **values)
+
+
+def refuse_functions(what: str, values: Mapping[str, Any]) -> None:
+    """ValueError for values that are functions, which a checkpoint could not keep."""
+    for name, value in values.items():
+        if callable(value):
+            raise ValueError(f"{name} of {what} can be set to numbers within a run; a function comes from the scene")
+
+
+def _change_part(world: World, kind: str, name: str, **values: Any) -> None:
+    there: dict[str, Named] = getattr(world, PARTS[kind])
+    part = there.get(name)
+    if part is None and kind == "load" and "on" in values:
+        part = Load(values["on"])
+    if part is None:
+        begins = "; give on=... to begin one" * (kind == "load")
+        raise ValueError(f"no {kind} {name!r}; there are: {', '.join(there) or 'none'}{nearest(name, there)}{begins}")
+    _refuse_others(f"{kind} {name!r}", values, part.CHANGED)
+    _put(world, kind, name, part.changed(world.time, world.tallies.get(name), **values))
+
+
+def _put(world: World, kind: str, name: str, part: Named) -> None:
+    if isinstance(part, Load):
+        refuse_load(world, name, part)
+    getattr(world, PARTS[kind])[name] = part
+    world.changed.add((kind, name))
+
+
+def refuse_load(world: World, name: str, load: Load) -> None:
+    """ValueError for a load on bodies that are not there, or that no force moves; not collective."""
+    if isinstance(load.on, str):
+        bodies_of_name = [body for body in world.large_bodies if body.name == load.on]
+        if bodies_of_name and not isinstance(bodies_of_name[0].motion, Dynamic):
+            raise ValueError(f"load {name!r}: the motion of the body {load.on!r} is prescribed, so no force moves it")
+        if bool(bodies_of_name) == (load.on in world.materials):
+            kind = "both a body and a material" if bodies_of_name else "neither a body nor a material"
+            raise ValueError(f"load {name!r}: {load.on!r} is {kind}")
+    elif load.ids is not None and len(wrong := load.ids[(load.ids < 0) | (load.ids >= world.ids)]):
+        raise ValueError(f"load {name!r}: there is no grain {wrong[0]}")
+
+
+# -- large bodies --------------------------------------------------------------------------------------------
+
+
+def _change_body(world: World, name: str, motion: Motion | None = None, **values: Any) -> None:
+    """Give a large body another motion, or its own one with other values as of `dem.motion.changed`; it begins where
+    it is now. If forces move the body, they go on doing so along the same line or about the same axis; else they
+    cannot begin to."""
+    names = [body.name for body in world.large_bodies]
+    if name not in names:
+        raise ValueError(f"no large body {name!r}; there are: {', '.join(names) or 'none'}{nearest(name, names)}")
+    row = names.index(name)
+    body = world.large_bodies[row]
+    if "surface_velocity" in values:
+        body = dataclasses.replace(body, surface=checked_surface(name, values.pop("surface_velocity")))
+    if motion is not None and values:
+        raise ValueError(f"body {name!r}: allowed is a motion, or parameters of the present one, not both")
+    if motion is not None or values:
+        motion = motions.changed(body.motion, world.time, **values) if motion is None else motion
+        pose = body.position, body.quaternion
+        motions.refuse_ignored(motion)
+        _refuse_other_ways(body, motion)
+        if not isinstance(motion, Dynamic):
+            pose = _leading_to(motion, world.time, world.large.position[row], world.large.quaternion[row])
+        body = dataclasses.replace(body, motion=motion, position=pose[0], quaternion=pose[1])
+    world.replace_large(body)
+
+
+def _refuse_other_ways(body: LargeBody, motion: Motion) -> None:
+    """ValueError for a motion by which forces would move a body in other ways than by its own, or would begin to."""
+    if not (isinstance(body.motion, Dynamic) or isinstance(motion, Dynamic)):
+        return
+    if type(motion) is not type(body.motion) or not np.allclose(_ways(motion), _ways(body.motion), atol=1e-12):
+        kind = f"{type(body.motion).__name__} with another drive" if isinstance(body.motion, Dynamic) else "a path"
+        raise ValueError(f"body {body.name!r} cannot change its motion to {motion!r}: allowed is {kind}")
+
+
+def _ways(motion: Any) -> Floats:
+    """Projectors (2, 3, 3) on what forces and torques can move."""
+    return np.array([motion.free_directions(), motion.free_turns()])
+
+
+def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> Pose:
+    """The pose at time zero of a body that the motion brings to this pose at `time`. ValueError if there is none."""
+    shift, turn = checked_pose(motion, time, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    back = quaternion.conjugate(turn)
+    start = quaternion.rotate(back, position - shift), quaternion.multiply(back, orientation)
+    place, turned = checked_pose(motion, time, *start)
+    size = np.abs([place, position]).max() + np.abs(shift).max()
+    if np.abs(place - position).max() > 1e-9 * size or abs(turned @ orientation) < 1.0 - 1e-9:
+        raise ValueError(f"{type(motion).__name__} does not displace the pose at time zero: the body would jump")
+    return start
+
+
+# -- the cell ------------------------------------------------------------------------------------------------
+
+
+def _change_cell(world: World, **values: Any) -> None:
+    """Shear the cell at another rate [1/s], ask for other stresses (3,) [Pa], or compress it at other rates (3,) [1/s],
+    in the place of stresses, from now on; None: none along an axis. ValueError if the scene has none of its kind."""
+    _refuse_others("cell", values, ("shear_rate", "stress", "strain_rate"))
+    shear, servo = world.shear, world.servo
+    if "shear_rate" in values:
+        if shear is None:
+            raise ValueError("shear_rate: the cell of this scene is not sheared; give the Scene a shear_rate, or 0")
+        shear = dataclasses.replace(shear, rate=float(checks.finite("shear_rate", values["shear_rate"])))
+    for name in ("stress", "strain_rate"):
+        if name in values and servo is None:
+            raise ValueError(f"{name}: the periods of this cell are constant; give the Scene a stress or a strain_rate")
+    if servo is not None and "stress" in values:
+        servo = dataclasses.replace(servo, asked=checks.stress(values["stress"]))
+    if servo is not None and "strain_rate" in values:
+        servo = dataclasses.replace(servo, strain=checks.strain_rate(values["strain_rate"]), start=world.time)
+    world.shear, world.servo = shear, servo
+
+
+# -- checkpoints ---------------------------------------------------------------------------------------------
+
+
+def changes(world: World) -> str:
+    """What was changed of parts and large bodies, as JSON for `restore`."""
+    found: dict[str, dict[str, Any]] = {}
+    for kind, name in sorted(world.changed):
+        if kind == "body":
+            entry = _entry(world.large_bodies[world.large_row(name)])
+        else:
+            part = getattr(world, PARTS[kind])[name]
+            entry = {key: getattr(part, key) for key in part.KEPT}
+        found.setdefault(kind, {})[name] = {key: value for key, value in entry.items() if not callable(value)}
+    return json.dumps(found, default=lambda array: array.tolist())
+
+
+def restore(world: World, text: str) -> None:
+    """Give a world, made from its scene, what `changes` has. ValueError for what is none."""
+    for kind, entries in json.loads(text).items():
+        for name, entry in entries.items():
+            if kind == "body":
+                world.replace_large(_restored(world.large_bodies[world.large_row(name)], entry))
+                continue
+            there = getattr(world, PARTS[kind])
+            if name not in there and kind != "load":
+                raise ValueError(f"the scene has no {kind} {name!r}")
+            part = there.get(name) or Load(None)
+            _refuse_others(f"{kind} {name!r}", entry, part.KEPT)
+            _put(world, kind, name, dataclasses.replace(part, **entry))
+
+
+def _entry(body: LargeBody) -> dict[str, Any]:
+    values = {field.name: getattr(body.motion, field.name) for field in dataclasses.fields(body.motion)}
+    kind = type(body.motion).__name__
+    pose = {"position": body.position, "quaternion": body.quaternion}
+    return {"motion": kind, "values": values, **pose, "surface": body.surface}
+
+
+def _restored(body: LargeBody, entry: Mapping[str, Any]) -> LargeBody:
+    """The body as an entry has it: its motion is one of `dem.motion` or that of the scene, with parameters that it has,
+    by which the body can move, and the pose is one."""
+    own, name = type(body.motion), body.name
+    kind = own if own.__name__ == entry["motion"] else motions.KINDS.get(entry["motion"])
+    if kind is None:
+        raise ValueError(f"body {name!r}: neither the scene nor dem.motion has the motion {entry['motion']}")
+    if strange := sorted({*entry["values"]} - {field.name for field in dataclasses.fields(kind)}):
+        raise ValueError(f"body {name!r}: its motion {kind.__name__} has no {strange[0]}")
+    motion = kind(**entry["values"])
+    _refuse_other_ways(body, motion)
+    place = checks.vector(f"position of {name!r}", entry["position"])
+    turn = checks.rows(f"quaternion of {name!r}", entry["quaternion"], 1, 4)[0]
+    if abs(np.linalg.norm(turn) - 1.0) > 1e-6:
+        raise ValueError(f"quaternion of {name!r} is {turn.tolist()}; allowed is one of unit norm")
+    surface = checked_surface(name, entry["surface"]) if "surface" in entry else body.surface
+    return dataclasses.replace(body, motion=motion, position=place, quaternion=turn, surface=surface)
+
+
+def _refuse_others(what: str, values: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
+    for name in values:
+        if name not in allowed:
+            raise ValueError(f"{what}: {name} cannot be set; allowed are {', '.join(allowed)}{nearest(name, allowed)}")
+

@@ -1,0 +1,202 @@
+"""The state of a simulation on one rank."""
+
+from __future__ import annotations
+
+import dataclasses
+from copy import copy
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import bodies
+from dem.arrays import Floats, Ints, Keys
+from dem.bodies import Bodies
+from dem.motion import Dynamic, Pose, checked_pose
+from dem.parts.contact_law import ContactLaw
+from dem.parts.joints import Joint
+from dem.parts.loads import Load
+from dem.parts.sources import Outlet, Source, Tally, as_array
+from dem.parts.springs import Spring
+from dem.scene import LargeBody
+from dem.shapes.forms import Form
+from dem.together import together
+
+
+@dataclass(frozen=True)
+class Shear:
+    """A simple shear of a periodic cell (Lees and Edwards 1972): flow along x, with its gradient along y or z."""
+
+    rate: float  #: d v_x / d y or z [1/s]
+    axis: int  #: of the gradient: 1 or 2
+    length: float  #: the period along it [m]
+    shift: float = 0.0  #: by how much the images behind that period are moved along x so far [m]
+
+    @property
+    def speed(self) -> float:
+        """Velocity along x of the images behind the period, relative to their grains [m/s]."""
+        return self.rate * self.length
+
+    def after(self, dt: float) -> Shear:
+        """dt [s] later."""
+        return dataclasses.replace(self, shift=self.shift + dt * self.speed)
+
+
+@dataclass(frozen=True)
+class Servo:
+    """The stresses or strain rates that a periodic cell is to have: its periods change, and all centres with them; see
+    `dem.step.servo`."""
+
+    asked: Floats  #: (3,) stresses along x, y, z, positive in compression; NaN: none [Pa]
+    strain: Floats  #: (3,) strain rates in the place of the stresses from `start` on, likewise [1/s]
+    start: float = 0.0  #: [s]
+    rate: Floats = field(default_factory=lambda: np.zeros(3))  #: (3,) of the periods in the last step, over them [1/s]
+
+    def given_at(self, time: float, dt: float) -> Floats:
+        """Rates (3,) at which the periods are to grow in the step of dt [s] from the `time` [s]; NaN: what the asked
+        stress needs, or none [1/s]."""
+        return -self.strain if time >= self.start - 1e-6 * dt else np.full(3, np.nan)
+
+
+#: The fields of a world that a step changes; what these refer to is replaced, and never changed in place.
+STATE = (
+    "grains", "large", "slabs", "only_spheres", "lists", "expected", "period", "shear", "servo", "tallies", "time",
+    "step", "spare",
+)  # fmt: skip
+
+
+@dataclass
+class World:
+    """Bodies, materials and time.
+
+    The global index of a body, which is its block row in matrices and vectors, counts the grains in the order
+    of the ranks' slabs and then the large bodies. Large bodies are the same on all ranks; their rows belong
+    to the last rank.
+    """
+
+    comm: MPI.Comm
+    large_bodies: tuple[LargeBody, ...]
+    gravity: Floats  #: (3,) [m/s^2]
+    pairs: ContactLaw  #: tables of the coefficients of contacts, by pair of materials
+    materials: tuple[str, ...]  #: their names; the column `material` of a table of bodies is an index into them
+    grains: Bodies  #: the slab of this rank; replace it by `set_grains` only
+    large: Bodies  #: one row per large body
+    loads: dict[str, Load] = field(default_factory=dict)  #: by name; `dem.model.changes.change` alone changes parts
+    springs: dict[str, Spring] = field(default_factory=dict)  #: by name
+    joints: dict[str, Joint] = field(default_factory=dict)  #: by name
+    #: pairs of ids, the lower + 1j the upper, of bodies that joints join and that do not touch each other
+    apart: Keys = field(default_factory=lambda: np.zeros(0, complex))
+    period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
+    sources: dict[str, Source] = field(default_factory=dict)  #: by name
+    outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
+    tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets, by name
+    forms: tuple[Form, ...] = ()  #: shapes of grains, by their numbers
+    initial: int = 0  #: number of grains at time zero
+    first_large: int = 0  #: id of the first large body
+    shear: Shear | None = None  #: of the cell
+    servo: Servo | None = None  #: of the size of the cell
+    time: float = 0.0  #: [s]
+    step: int = 0  #: number of steps done
+    spare: float = 3000.0  #: iterations that steps at rest may spend beyond the limits of the solver, `pctt.run.rest`
+    slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
+    only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
+
+    #: Kinds and names of what a run has changed by `dem.model.changes.change`: large bodies, loads, springs and others.
+    changed: set[tuple[str, str]] = field(init=False, default_factory=set)
+
+    lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
+
+    #: Velocities (springs, 2, 6) that the ends of springs were to have after the last step without contacts and drives.
+    expected: Floats | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        self.set_grains(self.grains)
+
+    def trial(self) -> World:
+        """A world that a step may change: this one stays as it is until it takes its state."""
+        other = copy(self)
+        other.grains, other.large = dataclasses.replace(self.grains), dataclasses.replace(self.large)
+        other.tallies = {name: dataclasses.replace(tally) for name, tally in self.tallies.items()}
+        return other
+
+    def take(self, trial: World) -> None:
+        """Take the state to which a step has brought a trial."""
+        for name in STATE:
+            setattr(self, name, getattr(trial, name))
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Arrays from which `dem.start.restored_world` makes this world again: rows of local grains, and replicated
+        ones."""
+        replicated = {f"large_{name}": column for name, column in self.large.columns().items()}
+        replicated.update(slabs=self.slabs, time=np.array(self.time), step=np.array(self.step))
+        if self.expected is not None:
+            replicated["expected"] = self.expected
+        replicated["spare"] = np.array(self.spare)
+        if self.tallies:
+            replicated["tallies"] = as_array(self.tallies)
+        if self.shear is not None:
+            replicated["shear"] = np.array([self.shear.rate, self.shear.shift])
+        if self.servo is not None:
+            servo = self.servo
+            replicated["servo"] = np.array([servo.asked, servo.strain, [servo.start] * 3, servo.rate, self.period])
+        return self.grains.columns(), replicated
+
+    def set_grains(self, grains: Bodies) -> None:
+        """Replace the slab of this rank; collective."""
+        self.grains, self.lists = grains, None
+        everyone = np.zeros((self.comm.size + 1, 2), np.int64)
+        self.comm.Allgather(np.array([len(grains), (grains.shape != bodies.SPHERE).any()], np.int64), everyone[1:])
+        self.slabs = np.cumsum(everyone[:, 0])
+        self.only_spheres = not everyone[:, 1].any()
+
+    @property
+    def ids(self) -> int:
+        """Number of grains that there have been; their ids are less."""
+        return self.initial + sum(self.tallies[name].count for name in self.sources)
+
+    @property
+    def body_count(self) -> int:
+        """Number of bodies on all ranks."""
+        return int(self.slabs[-1]) + len(self.large)
+
+    @property
+    def owned(self) -> int:
+        """Number of bodies whose rows this rank owns: its grains, and on the last rank the large bodies."""
+        return len(self.grains) + (len(self.large) if self.comm.rank == self.comm.size - 1 else 0)
+
+    def large_row(self, name: str) -> int:
+        """Row of a large body in `large`; KeyError if there is none of that name."""
+        names = [body.name for body in self.large_bodies]
+        if name not in names:
+            raise KeyError(f"no large body {name!r}; there are: {', '.join(names) or 'none'}")
+        return names.index(name)
+
+    def name_of(self, id: int) -> str:
+        """What messages call the body of this id."""
+        first = self.first_large
+        return f"grain {id}" if id < first else f"body {self.large_bodies[id - first].name!r}"
+
+    def replace_large(self, body: LargeBody) -> None:
+        """Put this large body in the place of that of its name; the same on all ranks."""
+        row = self.large_row(body.name)
+        self.large_bodies = (*self.large_bodies[:row], body, *self.large_bodies[row + 1 :])
+        self.changed.add(("body", body.name))
+
+    def poses(self, time: float) -> dict[int, Pose]:
+        """Places (3,) and quaternions (4,) of the large bodies of prescribed motion at `time` [s], by row; collective.
+        SceneError if a motion fails."""
+        return together(self.comm, "motion of a large body", lambda: {
+            row: checked_pose(body.motion, time, body.position, body.quaternion)
+            for row, body in enumerate(self.large_bodies) if not isinstance(body.motion, Dynamic)
+        })  # fmt: skip
+
+    def put_large(self, poses: dict[int, Pose]) -> None:
+        """Put large bodies, by row, into these poses."""
+        for row, pose in poses.items():
+            self.large.position[row], self.large.quaternion[row] = pose
+
+
+def turns_unlike_spheres(world: World) -> bool:
+    """Whether a body that turns freely may do so in another way than a sphere; the same on all ranks."""
+    return not world.only_spheres or bool(np.isfinite(world.large.inertia).all(axis=1).any())

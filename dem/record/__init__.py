@@ -1,0 +1,423 @@
+"""Records of a time step: forces on the large bodies, energies and their balance, statistics of the contacts.
+
+All functions are collective, and their results are the same on all ranks and, to rounding, for any number of ranks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import bodies
+from dem.arrays import ArrayLike, Bools, Floats, Ints
+from dem.bodies import COMPOUND, Bodies
+from dem.compiled import loop
+from dem.exchange import reduced
+from dem.experiment import Experiment
+from dem.model.period import wrapped
+from dem.model.world import World
+from dem.motion import Held
+from dem.start import stiffness
+from dem.step import Step
+from dem.step.servo import cell_stress
+from dem.together import SceneError, digest, together
+from dem.unconstrained import slots
+
+
+def row(step: Step, scene: Experiment) -> dict[str, float]:
+    """All quantities of a step by name, with units in brackets. SceneError if the scene's `record` fails or returns
+    something else than numbers by name."""
+    out = {"step": step.world.step, "time [s]": step.world.time}
+    out |= energy_balance(step) | contact_statistics(step) | passages(step.world)
+    out |= cell(step)
+    if scene.domain is not None:
+        out["grains_outside"] = outside(step, *scene.domain)
+    for body in step.world.large_bodies:
+        force = step.force_on(body.name)
+        out |= {f"force_{body.name}_{axis} [N]": force[k] for k, axis in enumerate("xyz")}
+        out |= {f"torque_{body.name}_{axis} [N m]": force[3 + k] for k, axis in enumerate("xyz")}
+    return out | _own(step, scene, out)
+
+
+def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str, float]:
+    """The quantities of the scene's own."""
+    if getattr(scene.record, "__func__", None) is Experiment.record:
+        return {}
+    what = f"record of the scene {type(scene).__name__}"
+
+    def record() -> dict[str, float]:
+        own: Any = scene.record(step)
+        if not isinstance(own, Mapping):
+            raise ValueError(f"record must return a dict of numbers by name, not {type(own).__name__}")
+        for name, value in own.items():
+            if not isinstance(name, str) or name in taken or not name or set(name) & set(',"\n'):
+                raise ValueError(f"record returns the name {name!r}: allowed is text without comma that is not in use")
+            if np.ndim(value) != 0:
+                raise ValueError(f"record returns {name!r} = {value!r}: allowed is a number")
+        return {name: float(value) for name, value in own.items()}
+
+    own = together(step.world.comm, what, record)
+    names = digest(str(list(own))) >> 8  # 52 bits
+    _, (most, least) = reduced(step.world.comm, (), (names, -names))
+    if most != -least:
+        raise SceneError(f"{what}: it must return the same names on all ranks, in the same order")
+    return own
+
+
+def passages(world: World) -> dict[str, float]:
+    """What has passed each source and outlet up to now, how many steps a source had no room, and the energies that
+    came and went with grains before this step [J]; nothing of a scene without."""
+    out: dict[str, float] = {}
+    for name, tally in world.tallies.items():
+        out |= {f"count_{name}": tally.count, f"mass_{name} [kg]": tally.mass}
+        if name in world.sources:
+            out[f"refused_{name}"] = tally.refused
+    if out:
+        for kind, names in (("sources", world.sources), ("outlets", world.outlets)):
+            out[f"energy_of_{kind} [J]"] = sum(world.tallies[name].energy for name in names)
+    return out
+
+
+def cell(step: Step) -> dict[str, float]:
+    """The periods at the end of the step, and the stress of its contacts and grains; nothing of a scene that is neither
+    sheared nor has a servo, or has a direction without a period."""
+    world, period = step.world, step.world.period
+    if period is None or np.isinf(period).any() or (world.shear is None and world.servo is None):
+        return {}
+    stress = cell_stress(world, step.contacts, step.force)
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    out = {f"period_{axis} [m]": float(period[k]) for k, axis in enumerate("xyz")}
+    return out | {f"stress_{'xyz'[i]}{'xyz'[j]} [Pa]": 0.5 * float(stress[i, j] + stress[j, i]) for i, j in pairs}
+
+
+def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
+    """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
+    place = wrapped(step.world.grains.position, step.world.period, step.world.shear)
+    return step.total(outside_of(place, np.asarray(low, float), np.asarray(high, float)))
+
+
+@loop
+def outside_of(place: Floats, low: Floats, high: Floats) -> int:
+    """How many places (n, 3) are outside the box from `low` to `high` (3,)."""
+    lost = 0
+    for n in range(len(place)):
+        x, y, z = place[n, 0], place[n, 1], place[n, 2]
+        lost += x < low[0] or x > high[0] or y < low[1] or y > high[1] or z < low[2] or z > high[2]
+    return lost
+
+
+#: A step has a jump of energy where the kinetic energy rises by more than its sources give, by this part of all that is
+#: there, or to so many times what there was.
+CREATED, SUDDEN = 0.1, 10.0
+SLOW = 0.1  #: a body is at rest below this part of the speed that a step of free fall gives
+CREEP = 1e-6  #: or below this part of its radius in a step
+SUNK = 1e-3  #: a rise of the energy is none if bodies would get it by sinking for this part of their radii
+
+
+def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
+    """Kinetic and potential energy [J] of the bodies of a table that forces can move; the potential energy is zero at
+    the origin."""
+    kinetic, moment = energies(table.position, table.quaternion, table.velocity, table.mass, table.inertia)
+    return kinetic, float(-(moment @ gravity))
+
+
+@loop
+def energies(position: Floats, turn: Floats, velocity: Floats, mass: Floats, inertia: Floats) -> tuple[float, Floats]:
+    """The kinetic energy [J] of n bodies with principal moments (n, 3), and the sum of mass times position (3,)
+    [kg m]. An infinite mass or moment does not move."""
+    kinetic, moment = 0.0, np.zeros(3)
+    for n in range(len(mass)):
+        if np.isfinite(mass[n]):
+            for k in range(3):
+                kinetic += 0.5 * mass[n] * velocity[n, k] ** 2
+                moment[k] += mass[n] * position[n, k]
+            w, x, y, z = turn[n, 0], -turn[n, 1], -turn[n, 2], -turn[n, 3]
+            a, b, c = velocity[n, 3], velocity[n, 4], velocity[n, 5]
+            p, q, r = y * c - z * b, z * a - x * c, x * b - y * a  # to the frame of the body
+            spin = (
+                a + 2.0 * (w * p + y * r - z * q), b + 2.0 * (w * q + z * p - x * r), c + 2.0 * (w * r + x * q - y * p)
+            )  # fmt: skip
+            for k in range(3):
+                if np.isfinite(inertia[n, k]):
+                    kinetic += 0.5 * inertia[n, k] * spin[k] ** 2
+    return kinetic, moment
+
+
+def energy_balance(step: Step) -> dict[str, float]:
+    """Energies at the end of the step and where their change came from [J].
+
+        change of kinetic + potential + spring = work of motions and of cohesion - friction loss - impact loss
+                                                 + time stepping
+
+    With g the impulses and w the mean of the velocities before and after (of prescribed motions: that of the step), the
+    impulses do the work g' D' w. What its tangential part does not give to the springs of contacts is the friction
+    loss. What its normal part does not is lost in impacts, or pushes overlaps of rigid contacts apart where it is a
+    gain. The work of motions is that of prescribed bodies on the others, of the drives of guided and hinged bodies, of
+    what holds bodies in part, of belts, loads, springs and the shear of a cell. The rest is the error of the semi-
+    implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
+
+    Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be, but hold
+    no more than impulses have loaded them with (`dem.start.stiffness.spring_energies`). What they lose or gain
+    between two steps is in no term: the spring energy of a step less that before the next.
+
+    The jump is the rise of the kinetic energy in a step in which it rises by more than the work of motions, gravity
+    and springs allows, or to more than ten times what there was, although gravity and drives do not give that; else 0.
+    Less than what bodies get by sinking a little (SUNK) is none: structures swing on their springs.
+    Springs may give that too where no moving tool of prescribed motion can have loaded them. What there was includes
+    what bodies at rest have (SLOW), and what those have that go with the tool they touch.
+    """
+    world, near, comm, system = step.world, step.contacts.near, step.world.comm, step.system
+    first, moves = near.grains + near.ghosts, bodies.is_dynamic(world.large)
+    before = near.bodies.take(slice(0, near.grains)), near.bodies.take(slice(first, None))
+    after, own = (world.grains, world.large), 1 if comm.rank else 2  # the large bodies count once
+    was, now = (_each(energy(table, world.gravity) for table in tables[:own]) for tables in (before, after))
+    still, least = _each(_still(table, world.gravity, system.dt) for table in after[:own])
+    velocity = near.bodies.velocity.copy()
+    velocity[first:][~moves] = world.large.velocity[~moves]
+    mean = 0.5 * (velocity[first:] + world.large.velocity)
+    normal, tangential, opening = works(step, step.in_cone, velocity, step.moment)
+    elastic, elastic_at_end, strained, strained_at_end = spring_energies(step, velocity, opening)
+    cohesion = 0.0 if system.attraction is None else works(step, step.impulse, velocity)[0] - normal
+    loads = belts = flow = 0.0
+    if system.applied is not None:
+        loads = 0.5 * np.vdot(system.applied.grains, before[0].velocity + world.grains.velocity)
+    if system.surface is not None:
+        belts = -np.vdot(step.impulse[:, 1:], system.surface)
+    if system.drift is not None:
+        flow = -np.vdot(step.impulse, system.drift)
+    whole = _summed(
+        comm, kinetic_before=was[0], potential_before=was[1], kinetic=now[0], potential=now[1], normal=normal,
+        tangential=tangential, elastic=elastic, elastic_at_end=elastic_at_end, strained=strained,
+        strained_at_end=strained_at_end, still=still, least=least, carried=_carried(step, ~moves), cohesion=cohesion,
+        loads=loads, belts=belts, flow=flow,
+    )  # fmt: skip
+    holding = _holding_work(step, near.bodies.velocity[first:], mean)
+    joints, joints_at_end = _joint_works(step, before[0].velocity, mean)
+    driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + (whole["loads"] + whole["flow"])
+    driving = driving + whole["belts"] + (holding + joints)
+    work = driving - np.vdot(step.impulse_on_large[~moves], mean[~moves])
+    rise, fallen = whole["kinetic"] - whole["kinetic_before"], whole["potential_before"] - whole["potential"]
+    held, bent = whole["elastic_at_end"] - whole["elastic"], whole["strained_at_end"] - whole["strained"]
+    pulled, released = 2.0 * max(whole["cohesion"], 0.0), max(-held, 0.0) + max(-bent, 0.0)
+    pulled += max(joints_at_end - joints, 0.0)  # with the velocity of the end, for bodies that were at rest
+    there = whole["kinetic_before"] + whole["still"] + whole["carried"]
+    stored = whole["elastic"] + whole["strained"]
+    created = rise - fallen - work - released - pulled > CREATED * (there + stored + abs(work))
+    driven = max(fallen, 0.0) + max(driving, 0.0) + pulled + released * (whole["carried"] == 0.0)
+    jumps = rise > whole["least"] and (created or whole["kinetic"] - driven > SUDDEN * there + CREATED * driven)
+    change = whole["kinetic"] + whole["potential"] - whole["kinetic_before"] - whole["potential_before"]
+    made = change - work - whole["normal"] - whole["tangential"] - whole["cohesion"] + whole["belts"]
+    return {
+        "kinetic_energy [J]": whole["kinetic"],
+        "potential_energy [J]": whole["potential"],
+        "spring_energy_before [J]": stored,
+        "spring_energy [J]": whole["elastic_at_end"] + whole["strained_at_end"],
+        "work_of_motions [J]": work,
+        "friction_loss [J]": whole["belts"] - whole["tangential"] - bent,  # nothing is zero, not -0
+        "impact_loss [J]": 0.0 - whole["normal"] - held,
+        **({} if system.attraction is None else {"work_of_cohesion [J]": whole["cohesion"]}),
+        "time_stepping [J]": made,
+        "energy_jump [J]": comm.bcast(rise if jumps else 0.0),  # what follows from it must not differ between ranks
+    }
+
+
+def _each(pairs: Iterable[tuple[float, float]]) -> tuple[float, float]:
+    """The sums of the first and of the second numbers of pairs."""
+    first, second = zip(*pairs)
+    return sum(first), sum(second)
+
+
+def _summed(comm: MPI.Comm, **numbers: float) -> dict[str, float]:
+    """Numbers by name, summed over the ranks; collective."""
+    return dict(zip(numbers, reduced(comm, [*numbers.values()], ())[0]))
+
+
+def works(
+    step: Step, impulse: Floats, before: Floats, moment: Floats | None = None
+) -> tuple[float, float, Floats]:
+    """The work of this rank's normal impulses, and of its tangential ones and moments (nc, 3), on the mean of the
+    velocities `before` (rows, 6), of all rows of `near`, and of those after the step [J]; and the normal velocities
+    (nc,) of the latter; collective."""
+    system, near = step.system, step.contacts.near
+    after = np.zeros_like(before)
+    after[: near.grains] = step.world.grains.velocity
+    system.contact_map.halo.update(after)
+    after[near.grains + near.ghosts :] = step.world.large.velocity
+    normal, tangential, opening = system.contact_map.works(impulse, before, after)
+    if system.drift is not None:
+        normal, opening = normal + float(impulse[:, 0] @ system.drift[:, 0]), opening + system.drift[:, 0]
+        tangential += float(np.vdot(impulse[:, 1:], system.drift[:, 1:]))
+    if moment is not None and system.resistance is not None:
+        turning = system.resistance.map.turning
+        tangential += 0.5 * float(np.vdot(moment, turning(before) + turning(after)))
+    return normal, tangential, opening
+
+
+def spring_energies(step: Step, before: Floats, opening: Floats) -> tuple[float, float, float, float]:
+    """`dem.start.stiffness.spring_energies` of a step, with the velocities `before` (rows, 6) and the normal velocities
+    `opening` (nc,) of its end."""
+    system, contacts = step.system, step.contacts
+    came = system.contact_map.relative_velocities(before)[:, 0]
+    if system.drift is not None:
+        came = came + system.drift[:, 0]
+    gaps = contacts.gap - system.dt * came, contacts.gap, contacts.linear_gap + system.dt * opening
+    held = system.last, system.held, step.in_cone
+    return stiffness.spring_energies(system.stiffness, system.compliance, system.dt, *gaps, *held)
+
+
+def _still(table: Bodies, gravity: Floats, dt: float) -> tuple[float, float]:
+    """The kinetic energy [J] that bodies at rest may have by the errors of a solver: a part SLOW of what gravity gives
+    in a step, or a way of CREEP radii, of large bodies those of gyration. And the energy of their weights times a part
+    SUNK of these radii [J]."""
+    radius, g = bodies.bounding_radius(table), math.hypot(*gravity)
+    energy, moment = still_energy(table.mass, table.inertia, table.shape, radius, SLOW * dt * g, CREEP / dt)
+    return energy, SUNK * g * moment
+
+
+@loop
+def still_energy(
+    mass: Floats, inertia: Floats, shape: Ints, radius: Floats, fall: float, creep: float
+) -> tuple[float, float]:
+    """The kinetic energy [J] of n bodies with the speed `fall` [m/s], or with `creep` radii [1/s] if that is more; and
+    the sum of masses times radii [kg m]."""
+    energy, moment = 0.0, 0.0
+    for n in range(len(mass)):
+        if np.isfinite(mass[n]):
+            size = radius[n]
+            if shape[n] == COMPOUND:
+                size = np.sqrt(min(inertia[n, 0], inertia[n, 1], inertia[n, 2]) / mass[n])
+            size = size if np.isfinite(size) else 0.0  # what cannot turn has no radius
+            speed = max(fall, creep * size)
+            energy += 0.5 * mass[n] * speed**2
+            moment += mass[n] * size
+    return energy, moment
+
+
+def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
+    """The work [J] of what holds components of the velocities of `Held` bodies; velocities (large, 6) before the step,
+    and means of those before and after."""
+    work, world, system = 0.0, step.world, step.system
+    for row, body in enumerate(world.large_bodies):
+        if isinstance(body.motion, Held):
+            push = -step.impulse_on_large[row] - system.drive_impulse(world.large.velocity)[row]
+            push[:3] += body.mass * (world.large.velocity[row, :3] - before[row, :3] - system.dt * world.gravity)
+            held = np.eye(3) - body.motion.free_directions(), np.eye(3) - body.motion.free_turns()
+            work += float(mean[row, :3] @ held[0] @ push[:3] + mean[row, 3:] @ held[1] @ push[3:])
+    return work
+
+
+def _joint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, float]:
+    """The work [J] of joints and their motors on the bodies that forces move, on the mean velocities of the step and on
+    those of its end: velocities (grains, 6) of this rank's grains before the step, and means (large, 6) of those before
+    and after; collective."""
+    system, world = step.system, step.world
+    if system.joints is None:
+        return 0.0, 0.0
+    push = np.einsum("k,knx->nx", step.joint_impulses, system.joints.rows)
+    here, slot = slots(world, world.grains.id)
+    velocity = world.grains.velocity[here]
+    works = np.array([0.5 * np.vdot(push[slot], before[here] + velocity), np.vdot(push[slot], velocity)])
+    world.comm.Allreduce(MPI.IN_PLACE, works)
+    of_large = push[len(push) - 1 - len(world.large) : -1] * bodies.is_dynamic(world.large)[:, None]
+    return float(works[0] + np.vdot(of_large, mean)), float(works[1] + np.vdot(of_large, world.large.velocity))
+
+
+def _carried(step: Step, prescribed: Bools) -> float:
+    """The kinetic energy [J] that bodies have which go with the `prescribed` (large,) motions that they touch, on this
+    rank."""
+    velocity = np.where(prescribed[:, None], step.world.large.velocity, 0.0)
+    if not velocity.any():
+        return 0.0
+    near, arm = step.contacts.near, step.system.contact_map.given.arm
+    first, mass = near.grains + near.ghosts, near.bodies.mass
+    return carried_energy(velocity, first, mass, step.contacts.a, step.contacts.b, arm)
+
+
+@loop
+def carried_energy(velocity: Floats, first: int, mass: Floats, a: Ints, b: Ints, arm: Floats) -> float:
+    """The kinetic energy [J] that the lighter bodies of contacts with arms (nc, 6) between rows a, b (nc,) have at the
+    relative velocity of these: `velocity` (large, 6) from the row `first` on, and zero before."""
+    energy = 0.0
+    for c in range(len(b)):
+        if b[c] < first and a[c] < first:
+            continue
+        u, v, w = 0.0, 0.0, 0.0
+        for side, row in ((0, a[c]), (3, b[c])):
+            if row >= first:
+                x, y, z, sign = arm[c, side], arm[c, side + 1], arm[c, side + 2], 1.0 if side else -1.0
+                s = velocity[row - first]
+                u += sign * (s[0] + s[4] * z - s[5] * y)
+                v += sign * (s[1] + s[5] * x - s[3] * z)
+                w += sign * (s[2] + s[3] * y - s[4] * x)
+        energy += 0.5 * min(mass[a[c]], mass[b[c]]) * (u * u + v * v + w * w)
+    return energy
+
+
+def contact_statistics(step: Step) -> dict[str, float]:
+    """Statistics of the contacts: how many there are, how many bear forces and slide. Overlaps are those at the start
+    of the step.
+
+    A contact is active if its normal impulse exceeds 1 % of the mean, as solvers leave small impulses at others. It
+    slides if its tangential impulse is 99 % of what friction can bear, or more. The coordination number is the mean
+    number of active contacts per grain. The unbalanced force is the mean resultant of the forces on a grain over the
+    mean force of an active contact, as of Yade and PFC; 0 without contacts. Impacts at once are contacts that bounce
+    and are not among those whose order `dem.step.impacts` follows: where several of them act on a body in a step,
+    energy may be lost.
+    """
+    comm, contacts, impulse = step.world.comm, step.contacts, step.in_cone
+    grains, before = step.world.grains, contacts.near.bodies.velocity
+    push, size = momentum_change(grains.mass, before, grains.velocity), impulse_sizes(impulse)
+    (count, weight, push, size), _ = reduced(comm, (len(contacts), impulse[:, 0].sum(), push, size), ())
+    grain = contacts.near.bodies.shape != COMPOUND
+    least = 0.01 * weight / max(count, 1.0)
+    *sums, worst = counted(impulse, contacts.friction, contacts.gap, contacts.a, contacts.b, grain, least)
+    sums, (worst,) = reduced(comm, [*sums, step.system.at_once], (max(worst, contacts.held_overlap),))
+    bounces = {"impacts_at_once": sums[3]} if step.world.pairs.restitution.any() else {}
+    return {
+        "contacts": count,
+        "active_contacts": sums[0],
+        "coordination_number": sums[2] / max(step.world.slabs[-1], 1),
+        "sliding_fraction": sums[1] / max(sums[0], 1),
+        "unbalanced_force": push / max(step.world.slabs[-1], 1) * sums[0] / size if size > 0.0 else 0.0,
+        "worst_overlap [m]": worst,
+        **bounces,
+    }
+
+
+@loop
+def momentum_change(mass: Floats, before: Floats, after: Floats) -> float:
+    """The sum of the sizes of the changes of the momenta of n bodies of finite mass, with velocities (n, 6) before and
+    after [N s]; `before` may have more rows."""
+    total = 0.0
+    for n in range(len(mass)):
+        x, y, z = after[n, 0] - before[n, 0], after[n, 1] - before[n, 1], after[n, 2] - before[n, 2]
+        total += mass[n] * np.sqrt(x * x + y * y + z * z)
+    return total
+
+
+@loop
+def impulse_sizes(impulse: Floats) -> float:
+    """The sum of the sizes of impulses (nc, 3)."""
+    total = 0.0
+    for c in range(len(impulse)):
+        total += np.sqrt(impulse[c, 0] ** 2 + impulse[c, 1] ** 2 + impulse[c, 2] ** 2)
+    return total
+
+
+@loop
+def counted(impulse, friction, gap, a, b, grain, least):
+    """Of contacts of bodies in the rows a, b (nc,), those active whose normal impulse exceeds the `least`: their
+    number, how many of them slide, how many ends of them are at grains; and the greatest overlap of all, 0 if none."""
+    active, sliding, ends, worst = 0, 0, 0, 0.0
+    for c in range(len(gap)):
+        normal, bears = impulse[c, 0], 0.99 * friction[c] * impulse[c, 0]
+        worst = max(worst, -gap[c])
+        bearing, slides = normal > least, np.sqrt(impulse[c, 1] ** 2 + impulse[c, 2] ** 2) >= bears
+        active += bearing
+        sliding += bearing & slides
+        ends += bearing * (int(grain[a[c]]) + int(grain[b[c]]))
+    return active, sliding, ends, worst

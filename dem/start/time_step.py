@@ -1,0 +1,152 @@
+"""The time step and the contact distance that a scene needs, from its sizes and speeds.
+
+Three times matter: that in which the fastest tool goes a radius, that in which a grain falls about half of one,
+sqrt(R / g), and that in which a body that is no sphere turns by a radian. docs/mechanics.md has the errors of forces on
+tools over dt.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from dem import bodies
+from dem.arrays import Floats
+from dem.contact.primitives import extents
+from dem.motion import top_speed
+from dem.scene import LargeBody, Scene
+from dem.shapes import Plane
+from dem.start.falls import fall
+from dem.start.pressing import Pressing, pressing
+from dem.start.turns import TURN, turning_of_large
+
+DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/mechanics.md has the errors of forces
+FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
+FALLS = 1.5  #: the way in a step, in radii, of a grain that has fallen; two are the limit of `dem.step.fast`
+SHEARED = 0.01  #: the shear strain of a cell in a step
+STRAINED = 0.002  #: the strain of its periods in a step
+PASSING = 0.1  #: the step, in the time d sqrt(rho / P) in which the stress of a cell closes a hole
+SPRINGS = 0.2  #: the step times the highest frequency of springs; 2 is their limit
+PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same and steps take a quarter longer
+
+
+def recommended(scene: Scene) -> float:
+    """The time step [s] with which forces on tools are within a few per cent of those of smaller steps, grains that
+    fall go no further than FALLS of their half thicknesses, and bodies that are no spheres turn by no more than TURN at
+    time zero, to two digits; 0.01 s for a scene without all that."""
+    return min(needs(scene).values())
+
+
+def needs(scene: Scene) -> dict[str, float]:
+    """The time steps [s] that a scene needs, by what needs them."""
+    found = {"grains that come to rest": for_settling(scene)}
+    speed, pressed = fastest(scene), pressing(scene)
+    pushed = max(math.hypot(*acceleration) for acceleration in pressed.accelerations)
+    falls = max([falling(scene, pressed), *(speed for _, speed in pressed.impacts)])
+    if speed > 0.0:
+        found[f"what moves at {speed:.3g} m/s"] = _rounded(DRIVEN * smallest(scene) / speed)
+    if falls > 0.0:
+        found[f"falls to {falls:.3g} m/s"] = _rounded(FALLS * smallest(scene) / falls)
+    if pushed > math.hypot(*scene.gravity):
+        found[f"loads of {pushed:.3g} m/s^2"] = _rounded(FALLING * math.sqrt(smallest(scene) / pushed))
+    found.update(for_cell(scene))
+    if (spin := fastest_turn(scene)) > 0.0:
+        found[f"bodies that turn at {spin:.3g} rad/s"] = _rounded(TURN / spin)
+    if pressed.highest > 0.0:
+        found[f"springs of {pressed.highest:.3g} rad/s"] = _rounded(SPRINGS / pressed.highest)
+    return found
+
+
+def reason(scene: Scene) -> str:
+    """What the recommended time step is for."""
+    found = needs(scene)
+    return min(found, key=lambda name: found[name])
+
+
+def fall_remark(scene: Scene, dt: float) -> str:
+    """What to say of a dt [s] in which grains that fall go so far that `dem.step.fast` may end the run; empty if none
+    do."""
+    speed, size = falling(scene, pressing(scene)), smallest(scene)
+    if dt * speed <= 2.0 * size:
+        return ""
+    most = _rounded(FALLS * size / speed)
+    return f"dt {dt:g} s is too large: falls lead to {speed:.3g} m/s, further than two radii in a step; take {most:g} s"
+
+
+def falling(scene: Scene, pressed: Pressing) -> float:
+    """The greatest speed with which a grain may meet a body or the bed, by gravity and loads [m/s]."""
+    start = fastest_grain(scene)
+    return max(fall(scene, acceleration, start).last for acceleration in pressed.accelerations)
+
+
+def for_settling(scene: Scene) -> float:
+    """The time step [s] in which grains fall and come to rest; 0.01 s without gravity."""
+    return _rounded(FALLING * _fall(scene))
+
+
+def for_cell(scene: Scene) -> dict[str, float]:
+    """The time steps [s] that the motion of a cell and its stress need."""
+    found, every = {}, scene.expected()
+    if scene.shear_rate:
+        found[f"a shear rate of {scene.shear_rate:.3g} 1/s"] = _rounded(SHEARED / abs(scene.shear_rate))
+    if scene.strain_rate is not None and (rate := float(np.abs(np.nan_to_num(scene.strain_rate)).max())) > 0.0:
+        found[f"a strain rate of {rate:.3g} 1/s"] = _rounded(STRAINED / rate)
+    if scene.stress is not None and (pressure := float(np.nan_to_num(scene.stress).max())) > 0.0 and len(every):
+        thick, wide = 2.0 * bodies.least_half_thickness(every), 2.0 * bodies.bounding_radius(every)
+        square = 6.0 / np.pi * thick * every.mass / wide**2 / pressure  # d^2 rho / P of a sphere
+        found[f"a stress of {pressure:.3g} Pa"] = _rounded(PASSING * float(np.sqrt(square.min())))
+    return found
+
+
+def contact_distance(scene: Scene) -> float:
+    """The gap [m] below which a pair of bodies is a contact. What moves further within a step has a margin of its own,
+    see `dem.contact.search`. Cohesion has a range that it covers."""
+    return max(smallest(scene) / PARTS, scene.reach)
+
+
+def smallest(scene: Scene) -> float:
+    """Half thickness of the thinnest grain [m]; 0.1 m if there is none."""
+    half: Floats = bodies.least_half_thickness(scene.expected())
+    return float(half.min()) if len(half) else 0.1
+
+
+def fastest(scene: Scene) -> float:
+    """The greatest speed of a tool, or of a grain at time zero [m/s]."""
+    return max(fastest_tool(scene), fastest_grain(scene))
+
+
+def fastest_tool(scene: Scene) -> float:
+    """The greatest speed of a large body that stays with the grains [m/s]."""
+    return max((_top_speed(body) for body in scene.large_bodies if body.name not in scene.leaving), default=0.0)
+
+
+def fastest_grain(scene: Scene) -> float:
+    """The greatest speed of a grain at time zero [m/s]; in a sheared cell beside the flow."""
+    return float(scene.speeds(scene.expected()).max(initial=0.0))
+
+
+def fastest_turn(scene: Scene) -> float:
+    """The greatest angular speed at time zero of a body that is no sphere and that forces move [rad/s]."""
+    grains, large = bodies.turning(scene.expected()), turning_of_large(scene.large(), scene.large_bodies)
+    return float(np.concatenate([grains, large]).max(initial=0.0))
+
+
+def _fall(scene: Scene) -> float:
+    """sqrt(R / g) [s], in which a grain falls half its radius; 0.1 s without gravity."""
+    gravity = math.hypot(*scene.gravity)
+    return float(np.sqrt(smallest(scene) / gravity)) if gravity > 0.0 else 0.1
+
+
+def _top_speed(body: LargeBody) -> float:
+    """The greatest speed of a point of a large body [m/s]; a plane has no end, and counts by the body's centre."""
+    parts = tuple(shape for shape in body.shapes if not isinstance(shape, Plane))
+    reach = float(extents([parts])[0]) if parts else 0.0
+    start = float(np.linalg.norm(body.velocity[:3]) + np.linalg.norm(body.velocity[3:]) * reach)
+    return max(start, top_speed(body.motion, body.position, reach))
+
+
+def _rounded(seconds: float) -> float:
+    """Two digits, downwards: the same on processors that round in other ways."""
+    digits = 10.0 ** (np.floor(np.log10(seconds * (1 + 1e-9))) - 1)
+    return float(f"{np.floor(seconds * (1 + 1e-9) / digits) * digits:.2g}")

@@ -1,0 +1,60 @@
+"""How far bodies turn in a step that are no spheres: a step has to resolve it.
+
+The angular momentum of such a body depends on its orientation, and so do the places where it touches others. Errors are
+of second order in the angle of a step. Spheres may turn as fast as they will.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import bodies
+from dem.arrays import Floats
+from dem.model.world import World, turns_unlike_spheres
+from dem.scene import LargeBody
+from dem.shapes import Sphere
+
+TURN = 0.2  #: the greatest angle [rad] by which bodies that are no spheres should turn in a step
+SLACK = 1.1  #: times that is told: a body that tumbles freely turns faster at times
+STEADY = 5  #: steps after each other in which the same body does so before it is told: what it hits may stop it sooner
+
+
+def turning_of_large(table: bodies.Bodies, members: Sequence[LargeBody]) -> Floats:
+    """`dem.bodies.turning` of the large bodies of a table (n,) [rad/s]; zero of balls about their centres of mass."""
+    return bodies.turning(table) * np.array([not _is_ball(body) for body in members], float)
+
+
+def _is_ball(body: LargeBody) -> bool:
+    balls = all(isinstance(shape, Sphere) and not np.any(shape.center) for shape in body.shapes)
+    return balls and bool(np.ptp(body.inertia) <= 1e-9 * body.inertia.max())
+
+
+class TurnWatch:
+    """Tells once of a body that turns too far in a step: at the start, or later in STEADY steps after each other."""
+
+    def __init__(self) -> None:
+        self._times, self._last, self._told = STEADY - 1, -1, False
+
+    def look(self, world: World, dt: float) -> str:
+        """What to say of a dt [s] for the world as it is now, most often nothing; collective."""
+        if self._told or not turns_unlike_spheres(world):
+            return ""
+        speeds = np.concatenate([bodies.turning(world.grains), turning_of_large(world.large, world.large_bodies)])
+        ids = np.concatenate([world.grains.id, world.large.id])
+        row = int(np.argmax(speeds)) if len(speeds) else -1
+        mine = (float(speeds[row]), int(ids[row])) if len(speeds) else (0.0, -1)
+        speed, id = world.comm.allreduce(mine, MPI.MAX)
+        again = self._times + 1 if self._last in (-1, id) else 1
+        self._times = again if dt * speed > SLACK * TURN else 0
+        self._last = id
+        self._told = self._times >= STEADY
+        if not self._told:
+            return ""
+        angle, most = dt * speed, TURN / speed
+        return (
+            f"dt {dt:g} s is too large: {world.name_of(id)} turns by {angle:.2g} rad in a step, and errors are of the "
+            f"square of that; take at most {most:.2g} s"
+        )

@@ -1,0 +1,406 @@
+"""Impacts of spheres in their order, each at the place and the time at which the two bodies touch.
+
+A step solves all its contacts at once, with the directions of its end. That is right for bodies that stay in touch. Of
+bodies that fly, two meet at some time within the step, where their line of centres is another one, and one impact leads
+to the next. So impacts of spheres whose other contacts bear nothing of them are followed from one to the next, as
+event-driven dynamics does. Their contacts get the normal and the arms of the place of touch, and the normal velocity
+with which the two part in the end. The step then finds the impulses, with those of all others. They act from the time
+of touch on, so the bodies end where they would have come, and the angular momentum of a pair is kept.
+
+Impacts on what rests in a bed, or in a row of spheres that touch, are left to the step, which lets all happen at once.
+Source: Lubachevsky, How to simulate billiards and similar systems, Journal of Computational Physics 94, 1991.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from dem.arrays import Bools, Floats, Ints
+from dem.bodies import SPHERE
+from dem.compiled import inlined, loop
+from dem.contact import Contacts, velocities_about
+from dem.exchange import on_any
+from dem.geometry.vectors import cross, dot, plus
+from dem.model.world import World
+from dem.unconstrained import UnconstrainedMotion, jointed
+
+#: Kinds of contacts: of two spheres, of a sphere that bounces from a body that forces do not move, and all others.
+PAIR, WALL, OTHER = 0, 1, 2
+
+#: Impacts of one contact in a step, after which those of its bodies are left to the step: they end at rest together.
+MANY = 20
+
+#: The share of a change of velocity with which an impact may load another contact of its bodies.
+LOADS = 0.05
+
+#: Of a relative velocity: bodies that come together slower than that have met.
+ROUNDING = 1e-9
+
+#: The square of a step over the time of an impact, sqrt(m / k), above which no step resolves its spring.
+SHORT = 25.0
+
+
+def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> Contacts:
+    """The contacts of a step, of this motion without contacts, with what impacts that are followed change of them;
+    collective.
+
+    Followed are impacts of two spheres, and of spheres that bounce from bodies that forces do not move, if they come
+    faster than a fall of one step; without restitution those of two that are near no other. Two spheres that pass each
+    other have no contact that closes. In cells that deform, and where bodies attract each other, nothing is
+    followed."""
+    if world.shear is not None or world.servo is not None or world.pairs.cohesion.any():
+        return contacts
+    near, table, pairs, dt = contacts.near, contacts.near.bodies, world.pairs, motion.dt
+    grains, old = near.grains + near.ghosts, table.velocity
+    ball = table.shape == SPHERE
+    ball[grains:] = False
+    if world.joints:
+        ball &= ~np.isin(table.id, jointed(world)[0])
+    if pairs.restitution.any():
+        old = old.copy()
+        old[grains:] = motion.prescribed
+    period = np.full(3, np.inf) if world.period is None else world.period
+    slow, radius = dt * math.hypot(*world.gravity), np.ascontiguousarray(table.size[:, 0])
+    kind, bounce, offset, marked = struck(
+        contacts.a, contacts.b, contacts.normal, contacts.gap, contacts.linear_gap, ball, table.mass, radius,
+        table.material, pairs.restitution, pairs.stiffness, grains, table.position, old, period, dt, slow,
+    )  # fmt: skip
+    if not on_any(world.comm, bool(marked.any()))[0]:
+        return contacts
+    rows = np.stack([contacts.a, contacts.b], axis=1)
+    chosen = np.flatnonzero(_reached(world, contacts, rows[kind == PAIR], marked)[rows].any(axis=1))
+    free = velocities_about(contacts, motion.grains, old[grains:])
+    forced = free[:, :3] - old[:, :3]
+    columns = (table.position, free, forced, radius[:, None], table.mass[:, None], table.inertia[:, :1])
+    body, of = np.concatenate(columns, axis=1), rows[chosen]
+    arm = contacts.point[chosen] - table.position[of[:, 1]]
+    if contacts.moved is not None:
+        arm -= contacts.moved[chosen]
+    surface = free[of[:, 1], :3] + np.cross(free[of[:, 1], 3:], arm)
+    given = (contacts.linear_gap, bounce, contacts.friction, kind)
+    contact = np.concatenate(
+        [offset[chosen], contacts.normal[chosen], surface, *(x[chosen, None] for x in given)], axis=1
+    )
+    mine = np.concatenate([near.index[of], contact, body[of[:, 0]], body[of[:, 1]]], axis=1)
+    parts = world.comm.allgather(mine) if world.comm.size > 1 else [mine]  # few: all ranks follow all
+    first = sum(len(part) for part in parts[: world.comm.rank])
+    index, contact, one, two = np.split(np.concatenate(parts), np.cumsum([2, contact.shape[1], body.shape[1]]), axis=1)
+    names, pair = np.unique(index.astype(np.int64), return_inverse=True)
+    pair, state = pair.reshape(-1, 2), np.empty((len(names), body.shape[1]))
+    state[pair[:, 0]], state[pair[:, 1]] = one, two
+    more = np.bincount(pair.ravel())[pair].max(axis=1) > 1  # on all ranks together
+    contact[more & (contact[:, 10] == 0.0), 12] = OTHER
+    *found, lag = followed(pair, np.ascontiguousarray(contact), state, dt, slow)
+    here = slice(first, first + len(mine))
+    late, row = lag[pair[here, 1]] - lag[pair[here, 0]], names - world.slabs[world.comm.rank]
+    own = (row >= 0) & (row < near.grains)
+    of_grains = np.zeros((near.grains, 3))
+    of_grains[row[own]] = lag[own]
+    return _with_impacts(contacts, chosen, [x[here] for x in found], late, of_grains, dt)
+
+
+def _with_impacts(
+    contacts: Contacts, chosen: Ints, found: list[Any], late: Floats, lag: Floats, dt: float
+) -> Contacts:
+    """The contacts with what `followed` says of the `chosen` ones, with the change `late` (nc, 3) of the way from
+    body a to body b, and the `lag` (grains, 3)."""
+    (meets, after, gap, normal), known = found, np.isfinite(found[2])
+    if not (known.any() or lag.any() or late.any()):
+        return contacts
+    place, radius = contacts.near.bodies.position, contacts.near.bodies.size[:, 0]
+    linear, parting = contacts.linear_gap.copy(), np.full(len(contacts), np.nan)
+    parting[chosen[known]] = np.where(meets, after, -np.inf)[known]
+    by_impacts = np.einsum("ci,ci->c", contacts.normal[chosen], late)
+    linear[chosen] = np.where(known, gap - dt * after, linear[chosen] + by_impacts)
+    of_pairs = normal.any(axis=1)
+    met, n = chosen[of_pairs], normal[of_pairs]
+    a, b = contacts.a[met], contacts.b[met]
+    turned, point = contacts.normal.copy(), contacts.point.copy()
+    moved = np.zeros_like(point) if contacts.moved is None else contacts.moved.copy()
+    turned[met] = n
+    point[met] = place[a] + radius[a, None] * n
+    moved[met] = point[met] + radius[b, None] * n - place[b]
+    return replace(contacts, normal=turned, point=point, moved=moved, linear=linear, parting=parting, lag=lag)
+
+
+def _reached(world: World, contacts: Contacts, pairs: Ints, marked: Bools) -> Bools:
+    """The bodies (rows,) that impacts of the marked ones may reach: through open contacts of spheres, the rows `pairs`
+    (m, 2), that touch no other grain; collective."""
+    halo, flags = contacts.lists.halo, np.zeros((len(marked), 2))
+    beside = (contacts.gap <= 0.0) & (contacts.b < contacts.near.grains + contacts.near.ghosts)
+    flags[:, 0] = marked
+    flags[contacts.a[beside], 1] = flags[contacts.b[beside], 1] = 1.0
+    while True:
+        halo.add(flags)
+        np.minimum(flags, 1.0, out=flags)
+        halo.update(flags)
+        seen = flags[:, 0].sum()
+        goes_on = (flags[:, 0] > 0.0) & (flags[:, 1] == 0.0)
+        flags[pairs[goes_on[pairs].any(axis=1)], 0] = 1.0
+        if not on_any(world.comm, bool(flags[:, 0].sum() > seen))[0]:
+            return flags[:, 0] > 0.0
+
+
+@loop
+def struck(
+    one: Ints, two: Ints, normal: Floats, gap: Floats, linear: Floats, ball: Bools, mass: Floats, radius: Floats,
+    material: Ints, restitution: Floats, stiffness: Floats, grains: int, place: Floats, velocity: Floats,
+    period: Floats, dt: float, slow: float,
+) -> tuple[Ints, Floats, Floats, Bools]:  # fmt: skip
+    """Of contacts (nc,) of bodies in the rows `one` and `two` the kinds (nc,), the coefficients of restitution (nc,)
+    and the ways from the second bodies to their images (nc, 3); and which bodies (rows,) meet by the velocities before
+    the step, or pass each other while the linear gap closes. Those that press others that they touch are left out."""
+    count = len(one)
+    kind, bounce, offset = np.full(count, OTHER), np.empty(count), np.zeros((count, 3))
+    meets, passes, marked = np.zeros(count, np.bool_), np.zeros(count, np.bool_), np.zeros(len(place), np.bool_)
+    many = np.zeros(len(place), np.int64)
+    for c in range(count):
+        many[one[c]] += 1
+        many[two[c]] += 1
+    touches, presses, push = marked.copy(), marked.copy(), np.zeros((len(place), 3))
+    for c in range(count):
+        a, b, n = one[c], two[c], (normal[c, 0], normal[c, 1], normal[c, 2])
+        e, k = restitution[material[a], material[b]], stiffness[material[a], material[b]]
+        v = velocity[b, 0] - velocity[a, 0], velocity[b, 1] - velocity[a, 1], velocity[b, 2] - velocity[a, 2]
+        closed, closes, bounce[c] = gap[c] <= 0.0, linear[c] + dt * dot(v, n) < 0.0, e
+        if ball[a] and b >= grains and e > 0.0 and np.isinf(mass[b]):
+            kind[c], meets[c] = WALL, closes and dot(v, n) < -slow
+        elif ball[a] and ball[b] and (e > 0.0 or (many[a] == many[b] == 1 and _is_short(k, mass, a, b, dt))):
+            for i in range(3):
+                if np.isfinite(period[i]):
+                    offset[c, i] = -period[i] * np.rint((place[b, i] - place[a, i]) / period[i])
+            time, speed = _meeting(_way(place, a, b, offset, c), v, radius[a] + radius[b])
+            kind[c], meets[c] = PAIR, time <= dt and speed < -slow
+            passes[c] = closes and not closed
+        if meets[c]:
+            for i in range(3):
+                push[a, i], push[b, i] = -n[i], n[i]
+        elif closed:
+            kind[c], touches[a], touches[b] = OTHER, True, True
+    for c in range(count):
+        if kind[c] == OTHER and gap[c] <= 0.0:
+            a, b, n = one[c], two[c], (normal[c, 0], normal[c, 1], normal[c, 2])
+            presses[a] = presses[a] or dot(n, (push[a, 0], push[a, 1], push[a, 2])) > LOADS
+            presses[b] = presses[b] or dot(n, (push[b, 0], push[b, 1], push[b, 2])) < -LOADS
+    for c in range(count):
+        a, b = one[c], two[c]
+        if kind[c] == WALL:
+            marked[a] = marked[a] or (meets[c] and not presses[a])
+        elif kind[c] == PAIR:
+            free = not (presses[a] or presses[b]) if meets[c] else passes[c] and not (touches[a] or touches[b])
+            marked[a], marked[b] = marked[a] or free, marked[b] or free
+    return kind, bounce, offset, marked
+
+
+@loop
+def followed(
+    pair: Ints, contact: Floats, state: Floats, dt: float, slow: float
+) -> tuple[Bools, Floats, Floats, Floats, Floats]:
+    """Follow the impacts of contacts of the bodies `pair` (nc, 2) through a step of dt [s].
+
+    contact (nc, 13): way from body b to its image (3), normal (3), velocity of the surface of b (3), linear gap,
+    restitution, friction, kind. state (n, 15): place (3), velocities of the step without contacts (6), the change of
+    the linear ones by forces (3), radius, mass, moment of inertia.
+
+    Returns which contacts (nc,) have impacts, their normal velocities after the last one (nc,), the gaps at the end
+    (nc,), NaN where they are left to the step, and the normals of pairs that meet (nc, 3), else zero; and by how much
+    (n, 3) bodies end beside the place to which their velocities after the step would bring them."""
+    start, link = _links(pair, len(state))
+    left, flies = np.zeros(len(state), np.bool_), np.zeros(len(state), np.bool_)
+    after, gap, c = np.zeros(len(pair)), np.full(len(pair), np.nan), 0
+    normal, now = np.empty((len(pair), 3)), np.empty((len(state), 9))
+    coming, times = np.empty(len(pair)), np.empty(len(pair), np.int64)
+    again = True
+    while again:
+        now[:], normal[:], times[:], again = state[:, :9], 0.0, 0, False
+        for c in range(len(pair)):
+            coming[c] = _next(c, pair, contact, state, now, left, 0.0, dt, slow)
+        while len(pair):
+            c = int(np.argmin(coming))
+            t = coming[c]
+            if t > dt:
+                break
+            times[c] += 1
+            if times[c] > MANY:
+                again = True
+                for side in range(2):
+                    left[pair[c, side]] = left[pair[c, side]] or side == 0 or contact[c, 12] == PAIR
+                break
+            n = _bounce(c, pair, contact, state, now, t, dt)
+            if times[c] == 1 and contact[c, 12] == PAIR:
+                normal[c, 0], normal[c, 1], normal[c, 2] = n
+            for side in range(2 if contact[c, 12] == PAIR else 1):
+                for k in range(start[pair[c, side]], start[pair[c, side] + 1]):
+                    coming[link[k]] = _next(link[k], pair, contact, state, now, left, t, dt, slow)
+        if again:
+            continue
+        flies[:] = ~left
+        for c in range(len(pair)):
+            a, b = pair[c, 0], pair[c, 1]
+            if contact[c, 12] == OTHER or left[a] or (contact[c, 12] == PAIR and left[b]):
+                acts, of_impacts = _acts(c, pair, contact, state, now, dt, slow)
+                flies[a], flies[b] = flies[a] and not acts, flies[b] and not acts
+                if of_impacts and not (left[a] and left[b]):
+                    left[a], left[b], again = True, True, True
+    for c in range(len(pair)):
+        met, both = times[c] > 0, flies[pair[c, 0]] and flies[pair[c, 1]]
+        if met or (contact[c, 12] == PAIR and both):
+            n = contact[c, 3], contact[c, 4], contact[c, 5]
+            if met and contact[c, 12] == PAIR:
+                n = normal[c, 0], normal[c, 1], normal[c, 2]
+            way, v, _ = _relative(c, pair, contact, state, now)
+            far = plus(way, dt, v)
+            after[c], gap[c] = dot(v, n), contact[c, 9] + dot(far, n)
+            if contact[c, 12] == PAIR:
+                gap[c] = np.sqrt(dot(far, far)) - state[pair[c, 0], 12] - state[pair[c, 1], 12]
+    return times > 0, after, gap, normal, now[:, :3] - state[:, :3]
+
+
+@inlined
+def _is_short(stiffness, mass, a, b, dt):
+    """Whether an impact without restitution of two bodies is over in much less than a step."""
+    return stiffness * dt * dt * (1.0 / mass[a] + 1.0 / mass[b]) > SHORT
+
+
+@inlined
+def _way(place, a, b, offset, c):
+    """From body a to the image of body b in a contact c."""
+    return (
+        place[b, 0] + offset[c, 0] - place[a, 0],
+        place[b, 1] + offset[c, 1] - place[a, 1],
+        place[b, 2] + offset[c, 2] - place[a, 2],
+    )
+
+
+@inlined
+def _meeting(way, velocity, distance):
+    """When two spheres with this way between their centres, and this relative velocity, are a distance apart, and the
+    speed at which that grows then; infinite if never. Those that overlap meet at once."""
+    a, b, c = dot(velocity, velocity), dot(way, velocity), dot(way, way) - distance * distance
+    root = b * b - a * c
+    if b >= 0.0 or root <= 0.0:
+        return np.inf, 0.0
+    if c <= 0.0:
+        return 0.0, b / distance
+    root = np.sqrt(root)
+    return c / (root - b), -root / distance
+
+
+@inlined
+def _links(pair, count):
+    """The contacts of each body, as starts (count + 1,) and numbers."""
+    start = np.zeros(count + 1, np.int64)
+    for c in range(len(pair)):
+        start[pair[c, 0] + 1] += 1
+        start[pair[c, 1] + 1] += 1
+    start = np.cumsum(start)
+    link, to = np.empty(start[count], np.int64), start[:count].copy()
+    for c in range(len(pair)):
+        for side in range(2):
+            link[to[pair[c, side]]] = c
+            to[pair[c, side]] += 1
+    return start, link
+
+
+@inlined
+def _relative(c, pair, contact, state, now):
+    """Of a contact, as its bodies move `now`: the way from a to b at the start of the step (of a pair that of the
+    centres, else what impacts change of it), the relative velocity in the end, and its change by forces."""
+    a, b = pair[c, 0], pair[c, 1]
+    if contact[c, 12] == PAIR:
+        way, v = _way(now, a, b, contact, c), (now[b, 3] - now[a, 3], now[b, 4] - now[a, 4], now[b, 5] - now[a, 5])
+        forced = state[b, 9] - state[a, 9], state[b, 10] - state[a, 10], state[b, 11] - state[a, 11]
+    else:
+        way = (
+            now[b, 0] - state[b, 0] - now[a, 0] + state[a, 0],
+            now[b, 1] - state[b, 1] - now[a, 1] + state[a, 1],
+            now[b, 2] - state[b, 2] - now[a, 2] + state[a, 2],
+        )
+        v = (
+            contact[c, 6] + now[b, 3] - state[b, 3] - now[a, 3],
+            contact[c, 7] + now[b, 4] - state[b, 4] - now[a, 4],
+            contact[c, 8] + now[b, 5] - state[b, 5] - now[a, 5],
+        )
+        forced = -state[a, 9], -state[a, 10], -state[a, 11]
+    return way, v, forced
+
+
+@inlined
+def _next(c, pair, contact, state, now, left, begin, dt, slow):
+    """When the bodies of a contact meet next, from the time `begin` on; infinite if not in the step."""
+    a, b = pair[c, 0], pair[c, 1]
+    if contact[c, 12] == OTHER or left[a] or (contact[c, 12] == PAIR and left[b]):
+        return np.inf
+    way, v, forced = _relative(c, pair, contact, state, now)
+    if contact[c, 12] == PAIR:
+        later, speed = _meeting(plus(way, begin, v), v, state[a, 12] + state[b, 12])
+    else:  # the gap is gap + speed t + bend t^2 / 2, as forces act all the time
+        n = contact[c, 3], contact[c, 4], contact[c, 5]
+        bend, later = dot(forced, n) / dt, np.inf
+        gap, speed = contact[c, 9] + dot(way, n), dot(v, n) - 0.5 * dt * bend
+        gap, speed = gap + begin * (speed + 0.5 * begin * bend), speed + begin * bend
+        root = speed * speed - 2.0 * bend * gap
+        if root > 0.0 and (speed < 0.0 or bend < 0.0):
+            root = np.sqrt(root)
+            later = -(speed + root) / bend if speed >= 0.0 else max(2.0 * gap / (root - speed), 0.0)
+            speed += bend * later
+    enough = speed < -slow - ROUNDING * np.sqrt(dot(v, v))
+    return begin + later if enough and begin + later <= dt else np.inf
+
+
+@inlined
+def _bounce(c, pair, contact, state, now, time, dt):
+    """Let the bodies of a contact bounce at a time, with friction; returns the normal."""
+    a, b, of_two = pair[c, 0], pair[c, 1], contact[c, 12] == PAIR
+    way, v, forced = _relative(c, pair, contact, state, now)
+    n = contact[c, 3], contact[c, 4], contact[c, 5]
+    r, s = state[a, 12], 0.0
+    give, turn = 1.0 / state[a, 13], r * r / state[a, 14]
+    if of_two:
+        way, s = plus(way, time, v), state[b, 12]
+        far = np.sqrt(dot(way, way))
+        n = way[0] / far, way[1] / far, way[2] / far
+        give, turn = give + 1.0 / state[b, 13], turn + s * s / state[b, 14]
+    v = plus(v, time / dt - 0.5, forced)
+    v = plus(v, -r, cross((now[a, 6], now[a, 7], now[a, 8]), n))
+    if of_two:
+        v = plus(v, -s, cross((now[b, 6], now[b, 7], now[b, 8]), n))
+    speed = dot(v, n)
+    slide, push = plus(v, -speed, n), -(1.0 + contact[c, 10]) * speed / give
+    slides = max(np.sqrt(dot(slide, slide)), 1e-300)
+    rub = min(slides / (give + turn), contact[c, 11] * push) / slides
+    impulse = push * n[0] - rub * slide[0], push * n[1] - rub * slide[1], push * n[2] - rub * slide[2]
+    spin = cross(n, impulse)
+    for side in range(2 if of_two else 1):
+        body, sign = pair[c, side], -1.0 if side == 0 else 1.0
+        for k in range(3):
+            change = sign * impulse[k] / state[body, 13]
+            now[body, k] -= time * change
+            now[body, 3 + k] += change
+            now[body, 6 + k] -= state[body, 12] * spin[k] / state[body, 14]
+    return n
+
+
+@inlined
+def _acts(c, pair, contact, state, now, dt, slow):
+    """Whether a contact that is not followed closes in the step, faster than bodies at rest do; and whether its bodies
+    are in impacts then, or it closes by them."""
+    way, v, _ = _relative(c, pair, contact, state, now)
+    n, most, loaded = (contact[c, 3], contact[c, 4], contact[c, 5]), 0.0, 0.0
+    for side in range(2):
+        body, sign, size = pair[c, side], -1.0 if side == 0 else 1.0, 0.0
+        for k in range(3):
+            change = now[body, 3 + k] - state[body, 3 + k]
+            loaded += sign * change * n[k]
+            size += change * change
+        most = max(most, np.sqrt(size))
+    far = plus(way, dt, v)
+    closes = contact[c, 9] + dot(far, n) < 0.0
+    if contact[c, 12] == PAIR:
+        closes = np.sqrt(dot(far, far)) < state[pair[c, 0], 12] + state[pair[c, 1], 12]
+    fast = loaded < -LOADS * most or dot(v, n) - loaded < -2.0 * slow - LOADS * most
+    return closes and fast, closes and fast and most > 0.0

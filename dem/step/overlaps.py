@@ -1,0 +1,54 @@
+"""How far bodies overlap, over the half thickness of the thinner grain, and what leaves them so."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dem.arrays import Floats, Ints
+from dem.bodies import BOX, COMPOUND, FORM
+from dem.compiled import inlined, loop
+from dem.exchange import reduced
+from dem.step import Step
+
+
+def overlaps(step: Step, large: Floats) -> tuple[float, float]:
+    """The greatest overlap at the start of a step, and the greatest that the springs of contacts leave at its end under
+    the forces of the step, as parts of half thicknesses; of two large bodies those of the thinner, with the half
+    thicknesses `large` (large bodies,) [m]; collective."""
+    contacts, system, near = step.contacts, step.system, step.contacts.near
+    given = contacts.gap, contacts.linear_gap, step.in_cone, system.stiffness, system.compliance[:, 0], system.dt
+    first = near.grains + near.ghosts
+    found = deepest(*given, contacts.a, contacts.b, near.bodies.shape, near.bodies.size, large, first)
+    return tuple(reduced(step.world.comm, (), found)[1])  # type: ignore[return-value]
+
+
+@loop
+def deepest(
+    gap: Floats, linear: Floats, impulse: Floats, stiffness: Floats, compliance: Floats, dt: float, a: Ints, b: Ints,
+    shape: Ints, size: Floats, large: Floats, first: int,
+) -> tuple[float, float]:  # fmt: skip
+    """`overlaps` of contacts (nc,) of the bodies in the rows a, b, of which those from `first` on are large ones with
+    the half thicknesses `large`."""
+    start, held = 0.0, 0.0
+    for c in range(len(gap)):
+        # of an overlap d the part d c dt / (k dt^2 + c dt) is left, and of the impulse g dt C g (`dem.start.stiffness`)
+        left = dt * compliance[c] * impulse[c, 0]
+        if linear[c] < 0.0 and compliance[c] > 0.0:
+            left -= linear[c] * (1.0 - stiffness[c] * dt**2 * compliance[c])
+        if gap[c] >= 0.0 and left <= 0.0:
+            continue
+        half = min(_half(shape[a[c]], size[a[c]]), _half(shape[b[c]], size[b[c]]))
+        if half == np.inf:
+            half = min(large[a[c] - first], large[b[c] - first])
+        start, held = max(start, -gap[c] / half), max(held, left / half)
+    return start, held
+
+
+@inlined
+def _half(shape, size):
+    """The half thickness of a grain, as `dem.bodies.least_half_thickness`; inf of large bodies."""
+    if shape == COMPOUND:
+        return np.inf
+    if shape == BOX:
+        return min(size[0], size[1], size[2])
+    return size[2] if shape >= FORM else size[0]

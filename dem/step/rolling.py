@@ -1,0 +1,43 @@
+"""Resistance of contacts to rolling and spinning: the greatest moments, over the normal force, are lengths [m].
+
+Moments are measured in force times a length of each contact, and turning velocities in that length times an angular
+velocity: so all numbers of a contact have the same units and about the same size, and the residual of a solver means
+the same for moments as for forces.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dem.arrays import Floats
+from dem.contact import Contacts
+from dem.contact_map import ContactMap, TurningMap
+from dem.model.world import World
+
+
+class Resistance(NamedTuple):
+    """Of the contacts of a step: the map with their rows of turning, and what resists there."""
+
+    map: TurningMap
+    length: Floats  #: (nc,) [m]
+    rolling: Floats  #: (nc,) coefficients over the lengths
+    spinning: Floats  #: (nc,) likewise
+    velocity: Floats  #: (nc, 3) lengths times angular velocities without impulses [m/s]
+
+
+def resistance(world: World, contacts: Contacts, known: ContactMap, frame: Floats, free: Floats) -> Resistance | None:
+    """Of contacts with their map without turning, frames (nc, 3, 3), and the free velocities (rows, 6) of all bodies in
+    the rows of `near`; None, on all ranks, in a world without resistance."""
+    if not world.pairs.resists:
+        return None
+    table, a, b = contacts.near.bodies, contacts.a, contacts.b
+    one, two = table.material[a], table.material[b]
+    mobility = 1.0 / table.mass[a] + 1.0 / table.mass[b]
+    turns = (1.0 / table.inertia[a] + 1.0 / table.inertia[b]).mean(axis=1)
+    length = np.sqrt(np.divide(mobility, turns, out=np.ones(len(a)), where=(turns > 0.0) & (mobility > 0.0)))
+    turn = (frame * length[:, None, None]).reshape(-1, 9)
+    G = TurningMap(known.comm, known.given, turn, known.halo, known.body, mass=known.mass)
+    rolling, spinning = (values[one, two] / length for values in (world.pairs.rolling, world.pairs.spinning))
+    return Resistance(G, length, rolling, spinning, G.turning(free))

@@ -1,0 +1,460 @@
+"""The contact problem of one time step: free motion, contact frames, the map between bodies and contacts.
+
+With v the velocities of all bodies (6 each) and g the impulses of all contacts (normal, t1, t2 each):
+
+    D' v       velocities of body b relative to body a at the contact points, in the contact frames,
+    D g        impulses and angular impulses on the bodies: +g on b, -g on a,
+    v          = v_free + M^-1 D g,  v_free = v_old + dt M^-1 f,
+    G          = D' M^-1/2, the mass-scaled map, so that the Delassus matrix is N = G G' = D' M^-1 D,
+    r          = b + D' v_free,  b = (gap / dt, 0, 0) per contact.
+
+Bodies of prescribed motion have M^-1 = 0 and their prescribed velocity as v_free. For a guided body M^-1 is
+d d' / m, with d the direction of its guide.
+Source: Anitescu and Hart (2004), Tasora and Anitescu (2011): the cone complementarity problem of a time step.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import bodies
+from dem.arrays import Floats, Keys, places
+from dem.bodies import Bodies
+from dem.compiled import loop
+from dem.contact import Contacts
+from dem.contact_map import CompactRows, ContactMap, Halo
+from dem.contact_map.loops import closing, scale
+from dem.contact_map.mass import CellMass, JointedMass
+from dem.contact_map.rows import packed
+from dem.free_motion import kept_spin
+from dem.model.world import World, turns_unlike_spheres
+from dem.start import stiffness
+from dem.step.cohesion import along_normal, attraction
+from dem.step.rolling import resistance
+from dem.step.servo import cell_of
+from dem.step.surface import surface_velocities
+from dem.unconstrained import (
+    UnconstrainedMotion,
+    free_velocities,
+    joint_coupling,
+    joints_refound,
+    large_velocity,
+    slots,
+)
+from dem.unconstrained.drives import Drives, free_directions
+
+#: Bodies that contacts turned by more radians in the last step were struck: those impulses do not come again.
+STRUCK = 0.05
+MADE = 0.01  #: energy that impacts may make, as a part of what their impulses exchange, before they bounce less
+PARTS = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 1.0])  #: of e, that are tried from the last to the first
+
+
+class ContactSystem:
+    """The contact problem of one step on this rank. The constructor is collective; other members say so.
+
+    Attributes, of nc local contacts and of the bodies whose rows this rank owns (`World.owned`):
+        dt (float): step [s]
+        motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`, with the `push` and the joints of the step
+        contacts: as the search found them
+        key (nc,), mu (nc,), point (nc, 3): contact key, friction coefficient, contact point [m]
+        frame (nc, 3, 3): rows normal (from a to b), t1, t2
+        stiffness (nc,): of the contacts; inf: rigid [N/m]
+        compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
+        spring; 0: rigid [1/kg]
+        last (nc,), held (nc, 2): the normal impulses of the last step, and what tangential springs hold at the start of
+        this one [N s]
+        cell: its part in the step, a `dem.contact_map.mass.Cell`; None where its size is constant
+        drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
+        last step, in a cell that deforms [m/s]
+        surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.step.surface`; None if there is none
+        b (nc, 3): (gap / dt, surface) [m/s], see `gap_velocities`
+        r (nc, 3): b + D' v_free [m/s]; zero where it is rounding, see `dem.contact_map.loops.closing`
+        near: the bodies about this rank
+        contact_map: G, with the halo of the bodies; the rows of its tables are those of `near`
+        problem_map: G of the cone problem: with the rows of turning, where contacts resist it
+        free_velocity (owned, 6): velocities without contacts, but with their attraction
+        free_large (large, 6): the same of the large bodies, without attraction, on all ranks
+        middle (owned, 3): the angular velocities about which those of the step are linear in the impulses, see
+        `dem.free_motion.free_spin`, or None
+        resistance: the rows of `dem.step.rolling`, or None
+        attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.step.cohesion`
+        drives: of the large bodies, the same on all ranks
+        at_once: how many contacts of this rank bounce with all others of the step, and not in their order
+        joints: the rows of joints, a `dem.parts.joints.Coupling`; None if there are none
+        applied: what loads and springs give, a `dem.unconstrained.applied.Applied`; None if there are none
+    """
+
+    def __init__(
+        self, world: World, contacts: Contacts, motion: UnconstrainedMotion, recovery_speed: float = np.inf,
+        last: Floats | None = None, eased: tuple[Keys, Floats] | None = None, smooth: bool = False,
+    ) -> None:  # fmt: skip
+        """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart. `last`: what
+        the memory of the last step has of these contacts (parts nc, 3): the impulses that they are expected to have,
+        and with which springs begin. `eased`: contacts that bounce with a part of e alone, by key, from the method of
+        that name; `smooth`: impacts without friction."""
+        dt, near, owned = motion.dt, contacts.near, world.owned
+        if np.isnan(recovery_speed) or recovery_speed < 0.0:
+            raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
+        self.dt, self.contacts, self.near, self.drives, self.applied = dt, contacts, near, motion.drives, motion.applied
+        self.key, self.mu, self.point = contacts.key, contacts.friction, contacts.point
+        self.frame = contact_frames(contacts.normal)
+        self.contact_map = _map_of(world, contacts, self.frame, self.drives)
+        self.attraction = attraction(world, contacts, dt)
+        last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
+        self.motion, change = self._linearised(world, motion, last)
+        self.joints = self.motion.joints
+        free, freely, rounding = self._free(world, change)
+        self.free_velocity = free[:owned]
+        self.free_large = free[near.grains + near.ghosts :]
+        self.b = np.zeros((len(contacts), 3))
+        self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
+        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
+        self.surface = surface_velocities(world, contacts, self.frame)
+        if self.surface is not None:
+            self.b[:, 1:] = self.surface
+        self.take_flow(world, contacts)
+        self.cell = cell_of(world, contacts, self.frame, dt)
+        if self.cell is not None:
+            mass = CellMass(world.comm, self.contact_map.given.root, self.cell)
+            self.contact_map = self.contact_map.with_mass(mass)
+            mass.add_flow(self.cell.free, freely)
+        if contacts.drift is not None:
+            freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
+        self._attracted: Floats | float = 0.0  #: mass-scaled momenta of the attraction
+        if self.attraction is not None:
+            self._attracted = momentum = self.contact_map.momenta(along_normal(-self.attraction))
+            self.free_velocity = self.velocity_with(momentum)
+            freely += self.contact_map.velocities(momentum)
+        self.resistance = resistance(world, contacts, self.contact_map, self.frame, free)
+        self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
+        if self.resistance is not None and self.attraction is not None:
+            self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
+        self.at_once, self._freely = 0, freely
+        self._bounces, self._part = np.zeros(len(contacts), np.bool_), np.ones(len(contacts))
+        if world.pairs.restitution.any():
+            self._bounce(world, contacts, freely[:, 0], eased)
+        impacts = self._bounces
+        if contacts.parting is not None:
+            strikes = np.isfinite(contacts.parting)
+            self.b[strikes, 0], self.compliance[strikes] = -contacts.parting[strikes], 0.0
+            impacts = impacts | strikes
+        if smooth:
+            self.mu = np.where(impacts, 0.0, self.mu)
+        if contacts.swing is not None:  # impacts last no step
+            self.b[:, 1:] += np.where(impacts[:, None], 0.0, np.einsum("cij,cj->ci", self.frame[:, 1:], contacts.swing))
+        self.r = _beyond(self.b, freely, rounding)
+        stiffness.pull_back(self.r, self.compliance, self.held)
+        if self.resistance is not None:
+            self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
+
+    def _linearised(
+        self, world: World, motion: UnconstrainedMotion, last: Floats
+    ) -> tuple[UnconstrainedMotion, Floats | None]:
+        """The motion with the joints, and with the push about which it is linear where bodies turn in other ways than
+        spheres, if it has none yet: that of the `last` impulses (nc, 3); and what the push changes of the velocities
+        (owned, 6). Collective."""
+        change, push = None, motion.push
+        if push is None and turns_unlike_spheres(world):
+            push = self.contact_map.momenta(self.net(last))
+        if push is not None:
+            change = np.empty_like(push)
+            scale(self.contact_map.given.root, push, change)
+            struck = self.dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
+            push[struck], change[struck] = 0.0, 0.0
+        joints = joint_coupling(world, motion, push) if motion.joints is None else motion.joints
+        return replace(motion, push=push, joints=joints), change
+
+    def _free(self, world: World, change: Floats | None) -> tuple[Floats, Floats, Floats]:
+        """Velocities (rows, 6) without contacts of the bodies of `near`, with joints, those of the contacts (nc, 3) and
+        their rounding (nc,); collective. Sets `middle` and the inverse mass of jointed bodies."""
+        given, row, owned = self.contact_map.given, self.contact_map.body, world.owned
+        free, self.middle = free_velocities(world, self.near, self.motion, change)
+        if self.applied is not None or change is not None:
+            self.contact_map.halo.update(free)
+        freely, rounding = closing(given.frame, given.arm, row, free)
+        if self.joints is not None:
+            here, slot = slots(world, self.near.bodies.id)
+            spin = self.joints.spin[slot]
+            free[here, 3:] = np.where(np.isnan(spin), free[here, 3:], spin)
+            free[here] += self.joints.change[slot]
+            if self.middle is not None:
+                self.middle[here[here < owned]] = self.joints.middle[slot[here < owned]]
+            freely, more = closing(given.frame, given.arm, row, free)
+            rounding += more
+            own = here < owned
+            jointed = JointedMass(world.comm, given.root, here[own], slot[own], self.joints.matrix)
+            self.contact_map = self.contact_map.with_mass(jointed)
+        return free, freely, rounding
+
+    def _bounce(
+        self, world: World, contacts: Contacts, freely: Floats, eased: tuple[Keys, Floats] | None
+    ) -> None:
+        """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton).
+
+        They begin if without impulses they close in the step, `freely` (nc,) [m/s], and come faster than a fall of one
+        step: a body at rest does not bounce."""
+        table, a, b = contacts.near.bodies, contacts.a, contacts.b
+        e = world.pairs.restitution[table.material[a], table.material[b]]
+        came = self.contact_map.relative_velocities(table.velocity)[:, 0]
+        if self.drift is not None:
+            came = came + self.drift[:, 0]
+        closes = contacts.linear_gap + self.dt * freely < 0.0
+        begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & closes
+        if contacts.parting is not None:
+            begin &= np.isnan(contacts.parting)
+        self.at_once, self._bounces = int(begin.sum()), begin
+        if eased is not None:
+            place = places(eased[0], self.key)
+            self._part[place >= 0] = eased[1][place[place >= 0]]
+            e = e * self._part
+        self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
+        self.compliance[begin] = 0.0
+
+    def eased(self, world: World, impulse: Floats, momentum: Floats) -> tuple[Keys, Floats] | None:
+        """Contacts that are to bounce less, by key, and with which part of e: the next one for those whose impulses do
+        work, where all contacts together, with these impulses (parts nc, 3) and momenta, make energy. Newton's law of
+        impacts may do so with friction (Kane and Levinson 1985), and does not at e = 0. None if they make none, or if
+        no part is left; collective."""
+        if not world.pairs.restitution.any():
+            return None
+        parts = 1 if self.resistance is None else 2
+        g = impulse.reshape(parts, len(self.key), 3)
+        change = self.problem_map.velocities(momentum.reshape(-1, 6)).reshape(g.shape)
+        slips = [self._freely if self.surface is None else self._freely + np.pad(self.surface, ((0, 0), (1, 0)))]
+        free = np.stack(slips if self.resistance is None else [*slips, self.resistance.velocity])
+        work, exchanged = np.einsum("pci,pci->c", g, free + 0.5 * change), 0.5 * np.einsum("pci,pci->", g, change)
+        less = self._bounces & (work > 0.0) & (self._part > 0.0)
+        sums = self.contact_map.comm.allreduce(np.array([work.sum(), exchanged, less.sum()]))
+        if sums[2] == 0.0 or sums[0] <= MADE * sums[1]:
+            return None
+        self._part[less] = PARTS[np.searchsorted(PARTS, self._part[less]) - 1]
+        eased = self._part < 1.0
+        return self.key[eased], self._part[eased]
+
+    def held_after(self, impulse: Floats) -> Floats:
+        """Impulses of the step (parts nc, 3), see `ContactLaw.parts`, with what tangential springs hold at its end
+        in the place of the tangential ones [N s]."""
+        return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
+
+    def net(self, impulse: Floats) -> Floats:
+        """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
+        return impulse if self.attraction is None else impulse - along_normal(self.attraction)
+
+    def parts(self, impulse: Floats) -> tuple[Floats, Floats | None]:
+        """What contacts do to bodies (nc, 3), and their moments (nc, 3) where they resist rolling, for the impulses
+        (parts nc, 3) of the cone problem [N s]."""
+        count = len(self.key)
+        return self.net(impulse[:count]), None if self.resistance is None else impulse[count:]
+
+    def velocity(self, impulse: Floats) -> Floats:
+        """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""
+        return self.velocity_with(self.contact_map.momenta(impulse))
+
+    def velocity_with(self, momentum: Floats) -> Floats:
+        """Velocities (owned, 6) after the step for the mass-scaled momenta G' g (owned, 6), in any shape."""
+        change = np.empty_like(self.free_velocity)
+        self.contact_map.mass.scale(momentum.reshape(-1, 6), change)
+        return self.free_velocity + change
+
+    def kept(self, velocity: Floats) -> Floats | None:
+        """The velocities (owned, 6) with which bodies go into the next step, where those of this one are `velocity`:
+        others of bodies that are no spheres, see `dem.free_motion.kept_spin`; None: the same."""
+        if self.middle is None:
+            return None
+        own = self.near.bodies.take(slice(len(velocity)))
+        out = velocity.copy()
+        rows = np.flatnonzero(np.isfinite(self.middle[:, 0]))
+        spins = velocity[rows, 3:], self.middle[rows]
+        out[rows, 3:] = kept_spin(own.quaternion[rows], *spins, own.inertia[rows], self.dt)
+        return out
+
+    def set_rate(self, world: World, momentum: Floats) -> None:
+        """Give a cell that deforms the rate of its periods in this step, for the momenta of `velocity_with`;
+        collective."""
+        mass = self.contact_map.mass
+        if isinstance(mass, CellMass) and world.servo is not None:
+            rate = mass.rate_of(momentum.reshape(-1, 6) + self._attracted)
+            world.servo = replace(world.servo, rate=mass.cell.free + rate)
+
+    def take_flow(self, world: World, contacts: Contacts) -> None:
+        """Take the drift of the contacts from the shear and the rate of the cell."""
+        flow = contacts.flow(world, contacts.near.bodies.position)
+        self.drift = None if flow is None else np.einsum("cij,cj->ci", self.frame, flow)
+
+    def impulse_on_large(self, impulse: Floats, moment: Floats | None = None) -> Floats:
+        """Impulses and angular impulses D g (large, 6) on the large bodies, the same on all ranks, from the impulses
+        and the moments of `dem.step.rolling` (nc, 3) of all ranks [N s, N m s]; collective."""
+        first = self.near.grains + self.near.ghosts
+        rows = np.flatnonzero(self.contact_map.body[:, 1] >= first)  # body b has the higher id
+        sums = self.contact_map.sums_of_impulses(impulse, rows)
+        if moment is not None and self.resistance is not None:
+            self.resistance.map.sums_of_moments(moment, rows, sums)
+        large = sums[first:].copy()
+        self.contact_map.comm.Allreduce(MPI.IN_PLACE, large)
+        return large
+
+    def joint_impulses(self, impulse: Floats, moment: Floats | None = None) -> Floats:
+        """Impulses (k,) of the rows of joints with these impulses and moments of contacts (nc, 3) [N s, N m s];
+        collective."""
+        if self.joints is None:
+            return np.zeros(0)
+        return self.joints.impulses(self._push(impulse, moment))
+
+    def refound(self, world: World, impulse: Floats, velocity: Floats) -> UnconstrainedMotion | None:
+        """The motion with other joints and drives, where the impulses (parts nc, 3) of the cone problem and the
+        velocities (owned, 6) show that other limits and motors hold, or that drives are too weak; else None.
+        Collective."""
+        known, joints, spent = self.motion, None, None
+        if self.joints is not None and self.joints.decides:
+            joints = joints_refound(world, self.joints, self._push(*self.parts(impulse)))
+        if self.drives.most.any():
+            large = large_velocity(world, known, velocity)
+            spent = self.drives.refound(self.drive_impulse(large), large)
+        if joints is None and spent is None:
+            return None
+        known = known if joints is None else replace(known, joints=joints)
+        return known if spent is None else known.with_spent(world, spent)
+
+    def _push(self, impulse: Floats, moment: Floats | None) -> Floats:
+        """What contacts alone give the jointed bodies (n, 6), mass-scaled."""
+        return self.problem_map.shared(impulse if moment is None else np.concatenate([impulse, moment]))
+
+    def drive_impulse(self, large: Floats) -> Floats:
+        """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities
+        `large` (large, 6) after the step."""
+        line, slip = self.drives.line, self.free_large - large
+        return self.drives.impulse + (self.drives.grip * np.einsum("bi,bi->b", line, slip))[:, None] * line
+
+
+def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> ContactMap:
+    """The map of contacts with these frames (nc, 3, 3), of bodies that nothing couples beside them; collective."""
+    near, owned, moves = contacts.near, world.owned, bodies.is_dynamic(contacts.near.bodies)
+    # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
+    row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
+    arm = contact_arms(contacts, near.bodies.position, row)
+    rows = CompactRows(frame.reshape(-1, 9), arm, body, inverse_root_masses(world, drives), owned)
+    ghosts = np.flatnonzero(touched)
+    index = near.index[ghosts]
+    owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
+    halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
+    return ContactMap(world.comm, rows, halo, row)
+
+
+def gap_velocities(
+    world: World, contacts: Contacts, dt: float, recovery_speed: float
+) -> tuple[Floats, Floats, Floats]:
+    """`dem.start.stiffness.gap_velocities` of these contacts."""
+    table, rows = contacts.near.bodies, (contacts.a, contacts.b)
+    return stiffness.gap_velocities(
+        world.pairs.stiffness, table.material, table.mass, *rows, contacts.linear_gap, dt, float(recovery_speed)
+    )
+
+
+def inverse_root_masses(world: World, drives: Drives) -> Floats:
+    """M^-1/2 of the bodies whose rows this rank owns, as `CompactRows.root` has it: (owned, 6) where that is all on all
+    ranks, else (owned, 12)."""
+    last = world.comm.rank == world.comm.size - 1
+    tables = [world.grains, gripped(world.large, drives)] if last else [world.grains]
+    if world.only_spheres and not bodies.is_dynamic(world.large).any():
+        parts = [_inverse_roots(table.mass, table.inertia) for table in tables]
+        return np.concatenate(parts) if last else parts[0]
+    owned = bodies.concatenate(tables)
+    translation = np.eye(3) / np.sqrt(owned.mass)[:, None, None]
+    guides = free_directions(world.large_bodies) if last else np.zeros((0, 3, 3))
+    translation[len(world.grains) :] = translation[len(world.grains) :] @ guides
+    return packed(np.stack([translation, bodies.inverse_root_inertia(owned)], axis=1))
+
+
+@loop
+def _inverse_roots(mass: Floats, inertia: Floats) -> Floats:
+    out = np.empty((len(mass), 6))
+    for n in range(len(mass)):
+        last = max(n - 1, 0)
+        same = n > 0 and mass[n] == mass[last]  # as the last body: many are
+        out[n, :3] = out[last, 0] if same else 1.0 / np.sqrt(mass[n])
+        for k in range(3):
+            same = n > 0 and inertia[n, k] == inertia[last, k]
+            out[n, 3 + k] = out[last, 3 + k] if same else 1.0 / np.sqrt(inertia[n, k])
+    return out
+
+
+def gripped(large: Bodies, drives: Drives) -> Bodies:
+    """The large bodies with what servos add to their masses and to their moments about hinges."""
+    if not drives.grip.any():
+        return large
+    mass, inertia = large.mass.copy(), large.inertia.copy()
+    mass += drives.grip * drives.line[:, :3].any(axis=1)
+    inertia[:, 2] += drives.grip * drives.line[:, 3:].any(axis=1)  # the z axis of a hinged body is that of its hinge
+    return replace(large, mass=mass, inertia=inertia)
+
+
+def contact_frames(normal: Floats) -> Floats:
+    """Orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
+
+    Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
+    but where the sign of its z component changes.
+    """
+    return _frames(normal).reshape(-1, 3, 3)
+
+
+@loop
+def _frames(normal: Floats) -> Floats:
+    out = np.empty((len(normal), 9))
+    for c in range(len(normal)):
+        x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
+        sign = np.copysign(1.0, z)
+        p = -1.0 / (sign + z)
+        q = x * y * p
+        out[c, 0], out[c, 1], out[c, 2] = x, y, z
+        out[c, 3], out[c, 4], out[c, 5] = 1.0 + sign * x * x * p, sign * q, -sign * x
+        out[c, 6], out[c, 7], out[c, 8] = q, sign + y * y * p, -y
+    return out
+
+
+def contact_arms(contacts: Contacts, position: Floats, row: np.ndarray) -> Floats:
+    """Vectors (nc, 6) from the centres of the two bodies of each contact, or of the image of the second, to its point;
+    `row` (nc, 2) are the bodies' rows, uint32, in a table of positions (rows, 3) [m]."""
+    moved = np.zeros((0, 3)) if contacts.moved is None else contacts.moved
+    return _arms(contacts.point, moved, position, row)
+
+
+@loop
+def _arms(point: Floats, moved: Floats, position: Floats, row: np.ndarray) -> Floats:
+    out = np.empty((len(row), 6))
+    for c in range(len(row)):
+        for k in range(3):
+            out[c, k] = point[c, k] - position[row[c, 0], k]
+            out[c, 3 + k] = point[c, k] - position[row[c, 1], k]
+            if len(moved):
+                out[c, 3 + k] -= moved[c, k]
+    return out
+
+
+@loop
+def _beyond(b: Floats, freely: Floats, rounding: Floats) -> Floats:
+    """b + freely (nc, 3), zero where it is not beyond the `rounding` (nc,)."""
+    out = np.empty((len(rounding), 3))
+    for c in range(len(rounding)):
+        for k in range(3):
+            speed = b[c, k] + freely[c, k]
+            out[c, k] = 0.0 if abs(speed) <= rounding[c] else speed
+    return out
+
+
+@loop
+def _rows_of(a, b, body, moves, owned):
+    """Of contacts of bodies in the rows a and b (nc,): the rows (nc, 2), the indices `body` (nc, 2) of those that move,
+    else -1, and which rows that this rank does not own they touch and move."""
+    row, moved = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64)
+    touched = np.zeros(len(moves), np.bool_)
+    for c in range(len(a)):
+        row[c, 0], row[c, 1] = a[c], b[c]
+        for k, n in enumerate((a[c], b[c])):
+            moved[c, k] = body[c, k] if moves[n] else -1
+            if n >= owned and moves[n]:
+                touched[n] = True
+    return row, moved, touched

@@ -1,0 +1,164 @@
+"""The motion of the bodies over a step without contacts: gravity, spin, loads, springs, drives, prescribed motions.
+
+It is found once, at the start of a step, and handed on: the search for contacts, the contact problem, the advance and
+the record take what they need from it. No other part of a step asks motions, loads or springs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import bodies
+from dem.arrays import Floats, Ints
+from dem.checks import positive
+from dem.free_motion import fallen, free_spin, free_velocity, gyroscopic, velocity_changes
+from dem.model.neighbourhood import Neighbourhood
+from dem.model.world import World
+from dem.motion import Pose
+from dem.parts import joints
+from dem.together import together
+from dem.unconstrained.applied import Applied, applied_impulses, ends_of, row_of
+from dem.unconstrained.drives import Drives, drives_of, given_velocities
+
+
+@dataclass(frozen=True)
+class UnconstrainedMotion:
+    """The motion over a step without contacts."""
+
+    dt: float  #: [s]
+    poses: dict[int, Pose]  #: of large bodies of prescribed motion at the end of the step, by row
+    #: (large, 6) mean velocities that motions give, see `dem.unconstrained.drives.given_velocities` [m/s, rad/s]
+    given: Floats
+    prescribed: Floats  #: (large, 6) of prescribed motions the same; other bodies keep theirs
+    applied: Applied | None  #: what loads and springs give; None without any
+    drives: Drives  #: of the large bodies, the same on all ranks
+    grains: Floats  #: (grains, 6) velocities of this rank's grains [m/s, rad/s]
+    #: (owned, 6) mass-scaled momenta that contacts are expected to give, about which bodies that are no spheres and
+    #: joints are linearised; None until contacts are known, and if all bodies turn as spheres do
+    push: Floats | None = None
+    joints: joints.Coupling | None = None  #: with that push, and with what contacts have shown of them; likewise None
+
+    def with_spent(self, world: World, spent: Ints) -> UnconstrainedMotion:
+        """The same with drives that give all their strength, see `Drives.spent`; collective."""
+        return replace(self, drives=_drives(world, self.dt, self.given, self.applied, spent))
+
+
+def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
+    """The motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a load fails, or
+    if dt is too large for the springs."""
+    positive("time step", dt)
+    poses = world.poses(world.time + dt)
+    given, moves = given_velocities(world, poses, dt), bodies.is_dynamic(world.large)
+    prescribed = np.where(moves[:, None], world.large.velocity, given)
+    applied, grains = applied_impulses(world, dt, given), free_velocity(world.grains, world.gravity, dt)
+    if applied is not None:
+        grains += velocity_changes(world.grains, applied.grains)
+    drives = _drives(world, dt, given, applied, np.zeros(len(world.large), int))
+    return UnconstrainedMotion(dt, poses, given, prescribed, applied, drives, grains)
+
+
+def _drives(world: World, dt: float, given: Floats, applied: Applied | None, spent: Ints) -> Drives:
+    pushed = None if applied is None else applied.large
+    call = partial(drives_of, world, dt, given, pushed, spent)
+    return together(world.comm, "motion of a large body", call) if bodies.is_dynamic(world.large).any() else call()
+
+
+def large_velocity(world: World, free: UnconstrainedMotion, velocity: Floats) -> Floats:
+    """Those (large, 6) of the large bodies, on all ranks, of the velocities (owned, 6) over the step of the bodies
+    whose rows each rank owns; collective."""
+    if not bodies.is_dynamic(world.large).any():
+        return free.prescribed
+    large = np.zeros_like(world.large.velocity)
+    count = len(world.grains)
+    large[: len(velocity) - count] = velocity[count:]  # all of them on the last rank, none elsewhere
+    world.comm.Bcast(large, root=world.comm.size - 1)
+    return large
+
+
+def free_velocities(
+    world: World, near: Neighbourhood, free: UnconstrainedMotion, change: Floats | None
+) -> tuple[Floats, Floats | None]:
+    """Velocities (rows, 6) of all bodies of `near` over a step without contacts, of which those of ghosts are not yet
+    right; and the angular ones (owned, 3) about which they are linear in the impulses, see
+    `dem.free_motion.free_spin`, NaN where they are so anywhere. None without a `change` (owned, 6), what contacts are
+    expected to change."""
+    velocity, _ = fallen(near.bodies, world.gravity, free.dt)
+    first = near.grains + near.ghosts
+    pushed = None
+    if free.applied is not None:
+        pushed = velocity_changes(world.grains, free.applied.grains)
+        velocity[: near.grains] += pushed
+    velocity[first:] = free.drives.free
+    if change is None:
+        return velocity, None
+    owned = len(change)
+    given, middle = np.zeros((owned, 3)), np.full((owned, 3), np.nan)
+    if pushed is not None:
+        given[: near.grains] = pushed[:, 3:]
+    if owned > near.grains:  # of the last rank, which has no ghosts
+        given[near.grains :] = velocity_changes(world.large, free.drives.impulse)[:, 3:]
+    own = near.bodies.take(slice(owned))
+    rows = gyroscopic(own)
+    now = own.quaternion[rows], own.velocity[rows, 3:], own.inertia[rows]
+    spin, middle[rows] = free_spin(*now, free.dt, (given + change[:, 3:])[rows])
+    velocity[rows, 3:] = spin + given[rows]
+    return velocity, middle
+
+
+def jointed(world: World) -> tuple[Ints, Ints]:
+    """The ids of the grains of joints, in order, and the rows (joints, 2) of the ends of joints among these, the large
+    bodies and the world."""
+    ends = [end for joint in world.joints.values() for end in joint.ends]
+    ids = np.unique([end for end in ends if isinstance(end, int)]).astype(np.int64)
+    return ids, np.array([row_of(world, ids, end) for end in ends]).reshape(-1, 2)
+
+
+def joint_coupling(world: World, free: UnconstrainedMotion, push: Floats | None = None) -> joints.Coupling | None:
+    """The joints in the step; None without any. `push` (owned, 6): the mass-scaled momenta that contacts are expected
+    to give the bodies whose rows this rank owns. Collective."""
+    if not world.joints:
+        return None
+    ids, row = jointed(world)
+    grains, large = np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity)
+    if free.applied is not None:
+        grains, large = free.applied.grains, free.applied.large
+    table = ends_of(world, ids, grains, large, free.given, free.dt)
+    gathered = np.zeros_like(table.free)
+    if push is not None:
+        id = np.concatenate([world.grains.id, world.large.id])[: len(push)]
+        here, slot = slots(world, id)
+        gathered[slot] = push[here]
+        world.comm.Allreduce(MPI.IN_PLACE, gathered)
+    given = list(world.joints.values()), row, table, free.dt, world.period, gathered
+    found = joints.coupling(*given) if world.comm.rank == 0 else None
+    return world.comm.bcast(found)  # processors may round in other ways
+
+
+def joints_refound(world: World, known: joints.Coupling, push: Floats) -> joints.Coupling | None:
+    """`dem.parts.joints.refound`, by the first rank for all; collective."""
+    found = joints.refound(known, push) if world.comm.rank == 0 else None
+    return world.comm.bcast(found)
+
+
+def slots(world: World, id: Ints) -> tuple[Ints, Ints]:
+    """Which rows of bodies with these ids (n,) are among the bodies that joints know, and their rows there."""
+    ids, first = jointed(world)[0], world.first_large
+    here = np.flatnonzero(np.isin(id, ids) | (id >= first))
+    return here, np.where(id[here] >= first, len(ids) + id[here] - first, np.searchsorted(ids, id[here]))
+
+
+def joints_now(world: World) -> tuple[joints.Geometry, Floats]:
+    """The joints as they are, and the velocities (joints, 2, 6) of their ends; collective."""
+    (ids, row), grains, large = jointed(world), world.grains, world.large
+    here = np.flatnonzero(np.isin(grains.id, ids))
+    own, gathered = grains.take(here), np.zeros((len(ids), 13))
+    gathered[np.searchsorted(ids, own.id)] = np.concatenate([own.position, own.quaternion, own.velocity], axis=1)
+    world.comm.Allreduce(MPI.IN_PLACE, gathered)  # each row is that of one rank
+    tools = np.concatenate([large.position, large.quaternion, large.velocity], axis=1)
+    rest = np.concatenate([np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], np.zeros((1, 6))], axis=1)
+    position, turn, velocity = np.split(np.concatenate([gathered, tools, rest]), [3, 7], axis=1)
+    return joints.geometry(list(world.joints.values()), row, position, turn, world.period), velocity[row]
