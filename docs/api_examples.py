@@ -428,7 +428,7 @@ for name, scene in SCENES.items():
     built = scene().build()
     print(f"{name:12} {len(built.grains()):5} grains; large bodies: {', '.join(b.name for b in built.large_bodies)}")
 
-# %% dem.model.world.World
+# %% dem.model.world.World, dem.contact_map.CompactRows
 from mpi4py import MPI
 
 from dem.start import new_world
@@ -506,8 +506,8 @@ for _ in range(3):
     print(len(contacts.gap), "contacts, the floor bears", round(-step.force_on("floor")[2], 3), "N")
     advance(world, free, contacts, system.velocity(result.impulse))
 
-# %% dem.contact_map.ContactMap, dem.contact_map.CompactRows, dem.contact_map.Halo,
-# dem.model.neighbourhood.Neighbourhood import numpy as np
+# %% dem.contact_map.ContactMap, dem.contact_map.Halo, dem.model.neighbourhood.Neighbourhood
+import numpy as np
 from mpi4py import MPI
 
 from dem.contact import find_contacts
