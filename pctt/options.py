@@ -127,9 +127,9 @@ def _refuse(given: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> N
     choices, check = metadata.get("choices"), metadata.get("check")
     if choices and value not in choices:
         raise OptionError(f"{given}: allowed is {_allowed(kind, metadata)}{nearest(value, choices)}")
-    if callable(check):  # the scene itself calls it
-        return
-    allowed, test = check or ("a finite number", lambda x: kind is not float or abs(x) <= sys.float_info.max)
+    most = math.inf if callable(check) else sys.float_info.max  # the scene itself calls a check that is a function
+    finite = ("a finite number", lambda x: kind is not float or -most <= x <= most)
+    allowed, test = check if isinstance(check, tuple) else finite
     if not test(value):
         raise OptionError(f"{given}: allowed is {allowed}")
 
