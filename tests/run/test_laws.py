@@ -107,7 +107,7 @@ def test_the_stiffness_goes_with_the_problem(program, settled, tmp_path, stiffne
     (line,) = steps(tmp_path)
     assert line["natural_residual"] <= 1.01e-6
     for path in line["dumped"]:
-        program("-problem", path, "-ccp_type", "apgd", "-ccp_tol", 1e-6, "-output", "again", "-overwrite")
+        program("-problem", path, "-ccp_type", "conic", "-ccp_tol", 1e-6, "-output", "again", "-overwrite")
         again = summary_of(tmp_path / "again")
         rest = 1.0 / (stiffness * 0.025**2)  # without damping
         assert 0.5 * rest <= again["mean_compliance"] <= rest
