@@ -267,5 +267,5 @@ def test_at_the_limit_of_operations_the_last_inverse_is_kept(limit):
         ksp = ready(shell(lambda i, j: A[i, j], A, grid=(size,)), rank=rank, setup_limit=limit)
         assert context(ksp).rank > 1
         its[rank] = solve(ksp)[0]
-    assert its[64] <= its[16] + 2
+    assert its[64] <= its[16] + 4  # none takes 28
     assert "the limit of operations" in report(ksp)

@@ -428,7 +428,7 @@ def test_much_friction_of_jointed_boxes_is_solved_by_interior_points():
     for _ in range(40):
         figures = sim.step()
         assert figures["converged"], figures["reason"]
-        assert figures["iterations"] < 2000
+        assert figures["iterations"] < 4000  # 27,000 by first-order methods alone
         newton += figures["newton_its"]
     assert newton > 0
 
