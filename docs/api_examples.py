@@ -466,11 +466,11 @@ print(len(table), "rows,", int(is_dynamic(table).sum()), "of them moved by force
 print("columns", ", ".join(table.columns()))
 
 # %% dem.unconstrained.UnconstrainedMotion
-from dem.scenes import Mixer
 from mpi4py import MPI
 
 from dem.start import new_world
 from dem.unconstrained import unconstrained
+from pctt.scenes import Mixer
 
 free = unconstrained(new_world(Mixer(n=1).build(), MPI.COMM_SELF), dt=0.01)
 print("without contacts a grain falls at", round(free.grains[0, 2], 4), "m/s after", free.dt, "s")
