@@ -1,7 +1,7 @@
 """The time step and the contact distance that a scene needs, from its sizes and speeds.
 
 Three times matter: that in which the fastest tool goes a radius, that in which a grain falls about half of one,
-sqrt(R / g), and that in which a body that is no sphere turns by a radian. docs/mechanics.md has the errors of forces on
+sqrt(R / g), and that in which a body that is no sphere turns by a radian. docs/choose.md has the errors of forces on
 tools over dt.
 """
 
@@ -21,7 +21,7 @@ from dem.start.falls import fall
 from dem.start.pressing import Pressing, pressing
 from dem.start.turns import TURN, turning_of_large
 
-DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/mechanics.md has the errors of forces
+DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/choose.md has the errors of forces
 FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
 FALLS = 1.5  #: the way in a step, in radii, of a grain that has fallen; two are the limit of `dem.step.fast`
 SHEARED = 0.01  #: the shear strain of a cell in a step
