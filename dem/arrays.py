@@ -67,7 +67,7 @@ def mixed(key):
 
 @loop
 def places(keys: Keys, asked: Keys) -> Ints:
-    """Where the keys `asked` (m,) are among distinct ones (n,), -1 for those that are not there.
+    """Where the keys `asked` (m,) are among others (n,), -1 for those that are not there; both are distinct ones.
 
     Most are where they are to be if both have the same order but for a few that came or went: each is sought behind the
     last one found, the further the more were sought in vain. What is left of both meets in a hash table with open

@@ -132,7 +132,7 @@ def find_contacts(
         i, j, reach = i[touch], j[touch], reach[touch]
     if len(world.apart):
         one, other = near.bodies.id[table.row[i]], near.bodies.id[table.row[j]]
-        touch = places(world.apart, np.minimum(one, other) + 1j * np.maximum(one, other)) < 0
+        touch = ~np.isin(np.minimum(one, other) + 1j * np.maximum(one, other), world.apart)
         i, j, reach = i[touch], j[touch], reach[touch]
     table, i, j, reach = table.of_members(i, j, reach)
     moved: Floats | None = None

@@ -27,6 +27,7 @@ from dem.unconstrained import UnconstrainedMotion, large_velocity
 
 ALIKE = 0.99  #: cosine between the normals of two linearisations of a contact of which the later one replaces the other
 
+
 @dataclass(frozen=True)
 class Step:
     """A step that was just made, with its forces, places and sums: the argument of a scene's `record`.
@@ -257,9 +258,9 @@ def _overlaps_of(contacts: Contacts, body: Ints) -> Floats:
     """How deep the pairs of bodies (n, 2) overlap in these contacts; 0 where they do not [m]."""
     over = contacts.take(contacts.gap < 0.0)
     pairs, row = np.unique(body @ [1.0, 1.0j], return_inverse=True)
-    pair = places(pairs, over.body @ [1.0, 1.0j])
-    deepest = np.zeros(len(pairs))
-    np.maximum.at(deepest, pair[pair >= 0], -over.gap[pair >= 0])
+    deepest, pair = np.zeros(len(pairs)), over.body @ [1.0, 1.0j]  # several contacts have one pair
+    here = np.isin(pair, pairs)
+    np.maximum.at(deepest, np.searchsorted(pairs, pair[here]), -over.gap[here])
     return deepest[row]
 
 

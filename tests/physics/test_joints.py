@@ -537,3 +537,15 @@ def test_joined_bodies_touch_each_other_only_if_asked(touching):
     sim.run(steps=20)
     gap = np.linalg.norm(sim.positions[1] - sim.positions[0])
     assert gap == pytest.approx(0.2 if touching else 0.15, abs=2e-3)
+
+
+def test_no_shape_of_a_joined_body_touches_the_other_body():
+    """Bodies of several shapes are as many pairs of shapes."""
+    scene = Scene(friction=0.5, gravity=(0, 0, 0))
+    bars = [Box((0.1, 0.1, 0.1), center=(0, 0, z)) for z in (0.0, 0.15, 0.3)]
+    for name, x in (("one", 0.0), ("other", 0.15)):
+        scene.add_body(name, bars, Dynamic(), position=(x, 0, 0), mass=1.0, inertia=(0.1, 0.1, 0.1))
+    scene.add_joint("weld", "one", "other", kind="fixed", anchor=(0.1, 0, 0))
+    sim = pctt.Simulation(scene, dt=0.005, solver="apgd", tol=1e-6, comm=MPI.COMM_SELF)
+    sim.run(steps=2)
+    assert len(sim.last.contacts) == 0
