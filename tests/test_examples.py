@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import re
@@ -22,7 +23,6 @@ from pctt.simulation import Simulation
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
-PAGE = (ROOT / "docs" / "examples.md").read_text()
 PICTURE_BYTES = 150_000
 
 
@@ -41,10 +41,12 @@ def run(name: str, steps: int, **options: str) -> tuple[object, dict[str, np.nda
     return given.scene, {column: np.array([row[column] for row in rows]) for column in rows[0]}
 
 
-def test_the_page_shows_every_example_and_its_picture():
+def test_the_page_shows_every_example_and_its_picture(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
     listed = {path.stem for path in EXAMPLES.glob("*.py")} - {"integral_problems", "comparison"}
-    assert set(re.findall(r"\]\(examples/(\w+)\.py\)", PAGE)) == listed
-    assert sorted(re.findall(r"\]\(examples/(\w+)\.png\)", PAGE)) == pictures.pictured()
+    page = importlib.import_module("pages").gallery()
+    assert set(re.findall(r"\]\(examples/(\w+)\.py\)", page)) == listed
+    assert sorted(re.findall(r":img-top: examples/(\w+)\.png", page)) == pictures.pictured()
     for name in pictures.pictured():
         assert (EXAMPLES / f"{name}.png").stat().st_size < PICTURE_BYTES
 
