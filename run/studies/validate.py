@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,8 @@ def table(rows: list[Row]) -> str:
             off = "inside" if row["deviation"] == 0.0 else f"{100 * row['deviation']:+.2g} %"
         found, off = f"{row['found']:.4g}{error}{unit}", off if row["agrees"] else f"**{off}**"
         lines.append([row["check"], row["quantity"], expected, found, off, row["source"]])
+    for line, before in reversed(list(pairwise(lines))):  # what repeats stands in its first row
+        line[0], line[5] = line[0] * (line[0] != before[0]), line[5] * (line[5] != before[5])
     return markdown(["", "quantity", "reference", "found", "deviation", "source"], lines)
 
 
