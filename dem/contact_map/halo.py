@@ -49,6 +49,12 @@ class Halo:
         self.begin_add(values)
         self.end_add(values)
 
+    def lower(self, values: np.ndarray) -> None:
+        """Lower the values of the owners to the least of their ghosts."""
+        self.begin_add(values)
+        for rows, arrived in self._wait():
+            values[rows] = np.minimum(values[rows], arrived)
+
     def begin_update(self, values: np.ndarray) -> None:
         """Owners may change their values after this, and read those of ghosts after `end_update`."""
         self._send(values, self._shared, self.ghosts, self._holders, self._owners)

@@ -68,6 +68,11 @@ class ContactMap:
         """The same rows between bodies of another inverse mass."""
         return ContactMap(self.comm, self.given, self.halo, self.body, self.precision, mass)
 
+    def part(self, contacts: Ints) -> ContactMap:
+        """The map of these contacts alone, ascending, which shares the bodies with this one. Collective."""
+        given, mass = self.given.only(contacts), self.mass.only(contacts)
+        return ContactMap(self.comm, given, self.halo, self.body[contacts], self.precision, mass)
+
     # -- products -------------------------------------------------------------------------------------------
 
     def velocities(self, v: Floats) -> Floats:

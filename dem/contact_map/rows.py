@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -43,6 +43,10 @@ class CompactRows:
     @property
     def rows(self) -> int:
         return len(self.frame)
+
+    def only(self, contacts: Ints) -> CompactRows:
+        """Those of these contacts."""
+        return replace(self, frame=self.frame[contacts], arm=self.arm[contacts], body=self.body[contacts])
 
     def checked(self) -> CompactRows:
         """The same arrays in the types that compiled loops trust; ValueError if they do not fit together."""

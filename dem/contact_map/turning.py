@@ -38,6 +38,12 @@ class TurningMap(ContactMap):
         """The same rows between bodies of another inverse mass."""
         return TurningMap(self.comm, self.given, self._given_turn, self.halo, self.body, self.precision, mass)
 
+    def part(self, contacts: Ints) -> TurningMap:
+        """The map of these contacts alone, ascending, which shares the bodies with this one. Collective."""
+        given, mass = self.given.only(contacts), self.mass.only(contacts)
+        turn, body = self._given_turn[contacts], self.body[contacts]
+        return TurningMap(self.comm, given, turn, self.halo, body, self.precision, mass)
+
     def turning(self, v: Floats) -> Floats:
         """The turning velocities (nc, 3) of the velocities (rows, 6) of all rows of a table of the halo, without a
         message."""

@@ -53,6 +53,7 @@ __all__ = [
     "measure",
     "newton_for",
     "solve",
+    "with_part",
 ]
 
 
@@ -113,6 +114,16 @@ def solve(
         result.asked, result.reason = asked, f"{type}: {asked.reason}; {other}: {second.reason}"
     for each in (result,) if result.asked is None else (result, result.asked):
         each.impulse = problem.shown(each.impulse)
+    return result
+
+
+def with_part(problem: ConeProblem, result: Result, rows: NDArray[np.intp], part: Result) -> Result:
+    """The result with the impulses of these rows from a result of their own (`ConeProblem.part`), and with its cost.
+    Collective."""
+    impulse = result.impulse.copy()
+    impulse[rows] = part.impulse
+    result = dataclasses.replace(result, impulse=impulse).after(part)
+    _measure(problem, result)
     return result
 
 

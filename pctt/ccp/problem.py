@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from dem.compiled import loop
@@ -137,6 +138,17 @@ class ConeProblem:
         other.__dict__.pop("N", None)
         other.r = r
         return other
+
+    def part(self, contacts: NDArray[np.intp]) -> ConeProblem:
+        """The problem of these contacts of this rank alone, ascending, of which no other has a body that moves.
+        Collective."""
+        assert self.contact_map is not None
+        rows = self.cones.rows_of(contacts)
+        return ConeProblem(
+            self.comm, self.r[rows], cones=self.cones.only(contacts), G=self.contact_map.part(contacts),
+            point=None if self.point is None else self.point[contacts],
+            key=None if self.key is None else self.key[contacts], compliance=self.compliance[contacts, :2],
+        )  # fmt: skip
 
     # -- the user's units ------------------------------------------------------------------------------------
 

@@ -5,6 +5,9 @@ step has to mend: in a bed that is stirred the motion itself changes more. At re
 solver that stops as soon as the limits are met shakes bodies at rest for ever, by as much as these allow; one that goes
 on stops the shaking, and then each step has nothing left to do. So at rest going on costs no more iterations, in all.
 
+So it is with an island, bodies that touch no other that moves, beside others that do: its part of the problem is solved
+once more, by itself.
+
 Many contacts may need more iterations than that is worth, in a bed, say. So the iterations beyond the limits are
 counted (`World.spare`): so many as SPARE, and a SHARE of all iterations, may lead nowhere.
 """
@@ -12,17 +15,22 @@ counted (`World.spare`): so many as SPARE, and a SHARE of all iterations, may le
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats
 from dem.compiled import loop
-from dem.exchange import reduced
+from dem.exchange import on_any, reduced
 from dem.model.world import World
 from dem.record import energy
+from dem.step.islands import contacts_at_rest
 from dem.step.system import ContactSystem
-from pctt.ccp import Limits, Result
+from pctt.ccp import ConeProblem, Limits, Result, with_part
+from pctt.ccp.cones import Array
+
+Solve = Callable[[ConeProblem, Array, Limits], Result]
 
 SLOW = 0.3  #: kinetic energy of bodies at rest, over that of a step of free fall: loose steps shake them by 0.2
 STILL = 2e-3  #: the same where many contacts are worth iterations: beds that settle have 0.004 to 0.07
@@ -37,8 +45,30 @@ def limits_of(limits: Limits, world: World, system: ContactSystem) -> Limits:
     part = _kinetic_part(world, system)
     if part >= SLOW:
         return limits
+    return _aimed(limits, world, part)
+
+
+def _aimed(limits: Limits, world: World, part: float) -> Limits:
+    """The same limits with an aim, for bodies with this part of the energy of a free fall."""
     spare = ATTEMPT if part < STILL and world.spare >= ATTEMPT else 0
     return dataclasses.replace(limits, aim=AIM, spare=spare)
+
+
+def with_islands(
+    world: World, system: ContactSystem, problem: ConeProblem, guess: Array, limits: Limits, solve: Solve, found: Result
+) -> Result:
+    """The result ``found`` by limits without an aim, with impulses of islands at rest that meet the aim: a part of the
+    problem, to which ``solve`` is applied. Collective."""
+    if limits.aim < 1.0 or not found.converged:
+        return found
+    contacts, part = contacts_at_rest(world, system, _passing(system, _tools(world, system)), SLOW)
+    if not on_any(world.comm, len(contacts) > 0)[0]:
+        return found
+    limits, rows = _aimed(limits, world, part), problem.cones.rows_of(contacts)
+    with problem.part(contacts) as alone:
+        finer = solve(alone, guess[rows], limits)
+    account(world, limits, finer)
+    return with_part(problem, found, rows, finer) if finer.converged else found
 
 
 def account(world: World, limits: Limits, result: Result) -> None:
@@ -65,9 +95,7 @@ def _kinetic_part(world: World, system: ContactSystem) -> float:
     (kinetic, fall, mass), _ = reduced(world.comm, sums, ())
     if kinetic >= SLOW * fall:  # so a bed that is stirred pays for two sums
         return np.inf
-    tools = free.copy()
-    tools[moves] = 0.0
-    _, (fastest,) = reduced(world.comm, (), (_passing(system, tools),))
+    _, (fastest,) = reduced(world.comm, (), (_passing(system, _tools(world, system)).max(initial=0.0),))
     passes = 0.5 * mass * fastest**2 > fall
     return np.inf if passes else float(kinetic / fall)
 
@@ -82,12 +110,22 @@ def falling_energy(mass: Floats, before: Floats, after: Floats) -> float:
     return energy
 
 
-def _passing(system: ContactSystem, tools: Floats) -> float:
-    """The greatest component [m/s] of a velocity that tools with the velocities (large, 6), belts and the flow of a
-    cell have at a contact of this rank."""
+def _tools(world: World, system: ContactSystem) -> Floats:
+    """The velocities (large, 6) of bodies of prescribed motion; zero of others."""
+    tools = system.free_large.copy()
+    tools[bodies.is_dynamic(world.large)] = 0.0
+    return tools
+
+
+def _passing(system: ContactSystem, tools: Floats) -> Floats:
+    """The greatest component (nc,) [m/s] of the velocity that tools with the velocities (large, 6), belts and the flow
+    of a cell have at each contact."""
     at_contacts = [known for known in (system.surface, system.drift) if known is not None]
     if tools.any():
         table = np.zeros_like(system.near.bodies.velocity)
         table[len(table) - len(tools) :] = tools
         at_contacts.append(system.contact_map.relative_velocities(table))
-    return max((float(np.abs(known).max(initial=0.0)) for known in at_contacts), default=0.0)
+    most = np.zeros(len(system.contacts))
+    for known in at_contacts:
+        most = np.maximum(most, np.abs(known).max(axis=1, initial=0.0))
+    return most

@@ -114,6 +114,43 @@ def test_many_contacts_at_rest():
     assert iterations < 45
 
 
+def beside(guest, **law):
+    """A column of ten spheres with a `guest` that moves, two metres away."""
+    scene = Scene(friction=0.5, **law)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_spheres([[0, 0, H * (1 + 2 * k)] for k in range(10)], H, 2500.0)
+    if guest == "roller":
+        scene.add_spheres([[2, 0, H]], H, 2500.0, velocity=(1, 0, 0))
+    elif guest == "mixed bed":
+        places = np.stack(np.meshgrid(*[2.4 * H * np.arange(3)] * 3), axis=-1).reshape(-1, 3) + [2, 0, 0.06]
+        scene.add_spheres(places, H, 2500.0)
+        scene.add_body("paddle", [Box((0.3, 0.02, 0.1))], Rotation((0, 0, 5)), position=(2.1, -0.15, 0.12))
+    elif guest == "pendulum":
+        scene.add_spheres([[2.5, 0, 1]], H, 2500.0)
+        scene.add_joint("string", 10, kind="ball", anchor=(2, 0, 1))
+        scene.add_spheres([[3, 0, H]], H, 2500.0, velocity=(0, 1, 0))
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("guest", "law"),
+    [("roller", {}), ("mixed bed", {}), ("pendulum", {}), ("roller", {"rolling": 0.002}), ("roller", {"restitution": 0.5})],
+)
+def test_a_column_is_at_rest_whatever_moves_beside_it(guest, law):
+    sim, share = pctt.Simulation(beside(guest, **law)), []
+    floor, weight = len(sim.ids), G * 10 * 2500.0 * 4 / 3 * np.pi * H**3
+
+    def note(sim):
+        on_floor = (sim.contacts.bodies == floor).any(axis=1) & (sim.contacts.bodies < 10).any(axis=1)
+        share.append(abs(sim.contacts.force[on_floor, 2].sum()) / weight)
+
+    sim.run(until=0.3)
+    sim.run(until=0.7, call=note)
+    assert sim.kinetic_energy > 1e-3
+    assert abs(np.mean(share) - 1.0) < 1e-4
+    assert np.std(share) < 1e-4  # 0.02 to 0.2 where all islands have the limits of the whole
+
+
 def test_a_stack_falls_that_hangs_over_too_far():
     sim = pctt.Simulation(overhang(1.06))
     sim.run(until=0.7)

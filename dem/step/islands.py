@@ -1,0 +1,130 @@
+"""Islands: bodies that contacts or joints connect, directly or through others. In a step no impulse of one reaches
+another, so each may have an accuracy of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dem import bodies
+from dem.arrays import Floats, Ints
+from dem.compiled import loop
+from dem.exchange import exchange, on_any
+from dem.model.world import World
+from dem.step.system import ContactSystem
+from dem.unconstrained import slots
+
+
+def contacts_at_rest(world: World, system: ContactSystem, passing: Floats, slow: float) -> tuple[Ints, float]:
+    """Find the contacts of islands at rest: those whose kinetic energy is below ``slow`` times that which a step of
+    free fall would give them, and which nothing passes faster than that.
+
+    passing : (nc,) speeds of tools, belts and flows at the contacts [m/s]
+
+    Returns the contacts of this rank, ascending, and the greatest part of that energy that one of these islands has. A
+    single contact is no island, and a cell that deforms connects all bodies. Collective."""
+    nothing = np.zeros(0, np.intp), np.inf
+    if system.cell is not None:
+        return nothing
+    near, contact_map = system.near, system.contact_map
+    moves = bodies.is_dynamic(near.bodies)
+    root, name = _named(world, system, moves)
+    sums, fastest = np.zeros((len(moves), 4)), np.zeros(len(moves))
+    table, free = near.bodies, system.free_velocity
+    _add_energies(root, moves, table.mass, table.inertia, table.velocity, free, sums)
+    _add_contacts(contact_map.body, root, moves, passing, sums, fastest)
+    each = np.flatnonzero((sums[:, 2:] > 0.0).any(axis=1))  # an island of this rank, or its share of one
+    owner = np.maximum(np.searchsorted(world.slabs, name[each], side="right") - 1, 0)
+    owner = np.minimum(owner, world.comm.size - 1)
+    columns = {"name": name[each], "sums": sums[each], "fastest": fastest[each], "row": each}
+    asked = exchange(world.comm, columns | {"rank": np.full(len(each), world.comm.rank)}, owner)
+    _, island = np.unique(asked["name"], return_inverse=True)
+    kinetic, fall, mass, count = (np.bincount(island, column) for column in asked["sums"].T)
+    most = np.zeros(len(mass))
+    np.maximum.at(most, island, asked["fastest"])
+    rests = (kinetic < slow * fall) & (0.5 * mass * most**2 <= fall) & (count > 1.0)
+    part = np.divide(kinetic, fall, out=np.zeros_like(fall), where=rests)
+    told = exchange(world.comm, {"row": asked["row"], "rests": rests[island], "part": part[island]}, asked["rank"])
+    resting = np.zeros(len(moves), np.bool_)
+    resting[told["row"][told["rests"]]] = True
+    a, b = contact_map.body.T
+    contacts = np.flatnonzero(resting[root[np.where(moves[a], a, b)]])
+    return contacts, float(told["part"].max(initial=0.0))
+
+
+def _named(world: World, system: ContactSystem, moves: np.ndarray) -> tuple[Ints, Ints]:
+    """Of the rows of a table of bodies (n,) the first row that is connected on this rank, and the least global index of
+    what is connected on all ranks; -1 for all that joints connect. Collective."""
+    near, halo = system.near, system.contact_map.halo
+    jointed = np.zeros(len(moves), np.bool_)
+    if system.joints is not None:
+        jointed[slots(world, near.bodies.id)[0]] = True
+    root = _roots(system.contact_map.body, moves, jointed & moves)
+    name = np.where(jointed & moves, -1, near.index)
+    while True:
+        before = name.copy()
+        _spread(root, name)
+        if world.comm.size == 1:
+            return root, name
+        halo.lower(name)
+        halo.update(name)
+        if not on_any(world.comm, bool((name != before).any()))[0]:
+            return root, name
+
+
+@loop
+def _roots(body, moves, jointed):
+    """The first rows (n,) that contacts of the rows `body` (nc, 2) connect with each row, through rows that move; those
+    that are jointed are connected. Union by the smaller row, with halved paths (Tarjan 1975)."""
+    parent = np.arange(len(moves))
+    first = -1
+    for n in range(len(moves)):
+        if jointed[n]:
+            first = n if first < 0 else first
+            parent[n] = first
+    for c in range(len(body)):
+        a, b = body[c, 0], body[c, 1]
+        if moves[a] and moves[b]:
+            while parent[a] != a:
+                parent[a] = parent[parent[a]]
+                a = parent[a]
+            while parent[b] != b:
+                parent[b] = parent[parent[b]]
+                b = parent[b]
+            parent[max(a, b)] = min(a, b)
+    for n in range(len(moves)):  # parents come before their children
+        parent[n] = parent[parent[n]]
+    return parent
+
+
+@loop
+def _spread(root, name):
+    """Give all rows of a root the least of their names."""
+    for n in range(len(root)):
+        name[root[n]] = min(name[root[n]], name[n])
+    for n in range(len(root)):
+        name[n] = name[root[n]]
+
+
+@loop
+def _add_energies(root, moves, mass, inertia, velocity, free, sums):
+    """sums (n, 4) += kinetic energy, that of the change of the linear velocities to `free` (owned, 6), and mass, of the
+    own bodies, which are the first rows, at their roots. The spin has the greatest of the moments of a body."""
+    for n in range(len(free)):
+        if moves[n]:
+            moment, to = max(inertia[n, 0], inertia[n, 1], inertia[n, 2]), root[n]
+            for i in range(3):
+                turn = moment * velocity[n, 3 + i] ** 2 if velocity[n, 3 + i] != 0.0 else 0.0
+                sums[to, 0] += 0.5 * (mass[n] * velocity[n, i] ** 2 + turn)
+                sums[to, 1] += 0.5 * mass[n] * (free[n, i] - velocity[n, i]) ** 2
+            sums[to, 2] += mass[n]
+
+
+@loop
+def _add_contacts(body, root, moves, passing, sums, fastest):
+    """Count the contacts (nc, 2) at the roots of their bodies, in the last of the sums (n, 4), and find the greatest of
+    the speeds `passing` (nc,) there."""
+    for c in range(len(body)):
+        a, b = body[c, 0], body[c, 1]
+        to = root[a] if moves[a] else root[b]
+        sums[to, 3] += 1.0
+        fastest[to] = max(fastest[to], passing[c])
