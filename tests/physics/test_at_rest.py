@@ -58,6 +58,7 @@ def at_rest(scene, seconds, begin, **settings):
     """The run, and from its time `begin` [s] on the force on the floor over the weight, step by step."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.simplefilter("ignore", DeprecationWarning)  # of the compiler of loops
         sim = pctt.Simulation(scene, **settings)
         weight, share, iterations = G * sim.comm.allreduce(sim.world.grains.mass.sum()), [], []
         sim.run(until=begin)
