@@ -8,10 +8,13 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.compiled import loop
+from dem.contact_map.halo import Halo
 from dem.exchange import exchange, on_any
 from dem.model.world import World
 from dem.step.system import ContactSystem
 from dem.unconstrained import slots
+
+ROUND = 3  #: contacts that a single sphere may have at rest
 
 
 def contacts_at_rest(world: World, system: ContactSystem, passing: Floats, slow: float) -> tuple[Ints, float]:
@@ -21,27 +24,36 @@ def contacts_at_rest(world: World, system: ContactSystem, passing: Floats, slow:
     passing : (nc,) speeds of tools, belts and flows at the contacts [m/s]
 
     Returns the contacts of this rank, ascending, and the greatest part of that energy that one of these islands has. A
-    single contact is no island, and a cell that deforms connects all bodies. Collective."""
+    single sphere is no island, and a cell that deforms connects all bodies. Collective."""
     nothing = np.zeros(0, np.intp), np.inf
     if system.cell is not None:
         return nothing
     near, contact_map = system.near, system.contact_map
     moves = bodies.is_dynamic(near.bodies)
-    root, name = _named(world, system, moves)
-    sums, fastest = np.zeros((len(moves), 4)), np.zeros(len(moves))
+    jointed = np.zeros(len(moves), np.bool_)
+    if system.joints is not None:
+        jointed[slots(world, near.bodies.id)[0]] = True
+    jointed &= moves
+    root = _roots(contact_map.body, moves, jointed)
+    sums, fastest = np.zeros((len(moves), 5)), np.zeros(len(moves))
     table, free = near.bodies, system.free_velocity
     _add_energies(root, moves, table.mass, table.inertia, table.velocity, free, sums)
     _add_contacts(contact_map.body, root, moves, passing, sums, fastest)
+    # where no rank has a share that rests no island does, as its sums are those of its shares
+    if not on_any(world.comm, bool((sums[:, 0] < slow * sums[:, 1]).any()))[0]:
+        return nothing
+    name = _names(contact_map.halo, root, np.where(jointed, -1, near.index))
     each = np.flatnonzero((sums[:, 2:] > 0.0).any(axis=1))  # an island of this rank, or its share of one
     owner = np.maximum(np.searchsorted(world.slabs, name[each], side="right") - 1, 0)
     owner = np.minimum(owner, world.comm.size - 1)
     columns = {"name": name[each], "sums": sums[each], "fastest": fastest[each], "row": each}
     asked = exchange(world.comm, columns | {"rank": np.full(len(each), world.comm.rank)}, owner)
-    _, island = np.unique(asked["name"], return_inverse=True)
-    kinetic, fall, mass, count = (np.bincount(island, column) for column in asked["sums"].T)
-    most = np.zeros(len(mass))
+    names, island = np.unique(asked["name"], return_inverse=True)
+    whole, most = np.zeros((len(names), 5)), np.zeros(len(names))
+    np.add.at(whole, island, asked["sums"])
     np.maximum.at(most, island, asked["fastest"])
-    rests = (kinetic < slow * fall) & (0.5 * mass * most**2 <= fall) & (count > 1.0)
+    kinetic, fall, mass, many, count = whole.T
+    rests = (kinetic < slow * fall) & (0.5 * mass * most**2 <= fall) & ((many > 1.0) | (count > ROUND))
     part = np.divide(kinetic, fall, out=np.zeros_like(fall), where=rests)
     told = exchange(world.comm, {"row": asked["row"], "rests": rests[island], "part": part[island]}, asked["rank"])
     resting = np.zeros(len(moves), np.bool_)
@@ -51,24 +63,18 @@ def contacts_at_rest(world: World, system: ContactSystem, passing: Floats, slow:
     return contacts, float(told["part"].max(initial=0.0))
 
 
-def _named(world: World, system: ContactSystem, moves: np.ndarray) -> tuple[Ints, Ints]:
-    """Of the rows of a table of bodies (n,) the first row that is connected on this rank, and the least global index of
-    what is connected on all ranks; -1 for all that joints connect. Collective."""
-    near, halo = system.near, system.contact_map.halo
-    jointed = np.zeros(len(moves), np.bool_)
-    if system.joints is not None:
-        jointed[slots(world, near.bodies.id)[0]] = True
-    root = _roots(system.contact_map.body, moves, jointed & moves)
-    name = np.where(jointed & moves, -1, near.index)
+def _names(halo: Halo, root: Ints, name: Ints) -> Ints:
+    """The least name (n,) that the rows connected on any ranks have; `root`: the row that stands for what is connected
+    on this one. Collective."""
     while True:
         before = name.copy()
         _spread(root, name)
-        if world.comm.size == 1:
-            return root, name
+        if halo.comm.size == 1:
+            return name
         halo.lower(name)
         halo.update(name)
-        if not on_any(world.comm, bool((name != before).any()))[0]:
-            return root, name
+        if not on_any(halo.comm, bool((name != before).any()))[0]:
+            return name
 
 
 @loop
@@ -107,8 +113,8 @@ def _spread(root, name):
 
 @loop
 def _add_energies(root, moves, mass, inertia, velocity, free, sums):
-    """sums (n, 4) += kinetic energy, that of the change of the linear velocities to `free` (owned, 6), and mass, of the
-    own bodies, which are the first rows, at their roots. The spin has the greatest of the moments of a body."""
+    """sums (n, 5) += kinetic energy, that of the change of the linear velocities to `free` (owned, 6), mass and number of
+    the own bodies, which are the first rows, at their roots. The spin has the greatest of the moments of a body."""
     for n in range(len(free)):
         if moves[n]:
             moment, to = max(inertia[n, 0], inertia[n, 1], inertia[n, 2]), root[n]
@@ -117,14 +123,15 @@ def _add_energies(root, moves, mass, inertia, velocity, free, sums):
                 sums[to, 0] += 0.5 * (mass[n] * velocity[n, i] ** 2 + turn)
                 sums[to, 1] += 0.5 * mass[n] * (free[n, i] - velocity[n, i]) ** 2
             sums[to, 2] += mass[n]
+            sums[to, 3] += 1.0
 
 
 @loop
 def _add_contacts(body, root, moves, passing, sums, fastest):
-    """Count the contacts (nc, 2) at the roots of their bodies, in the last of the sums (n, 4), and find the greatest of
+    """Count the contacts (nc, 2) at the roots of their bodies, in the last of the sums (n, 5), and find the greatest of
     the speeds `passing` (nc,) there."""
     for c in range(len(body)):
         a, b = body[c, 0], body[c, 1]
         to = root[a] if moves[a] else root[b]
-        sums[to, 3] += 1.0
+        sums[to, 4] += 1.0
         fastest[to] = max(fastest[to], passing[c])

@@ -40,7 +40,7 @@ def pairs_at_rest(bodies, velocity, links, dt):
     island = connected_components(coo_matrix((np.ones(len(links)), links.T), (count, count)), directed=False)[1]
     square = (velocity**2).sum(axis=1, where=np.arange(6) < 3) + 0.4 * (R * velocity[:, 3:] ** 2 * R).sum(axis=1)
     kinetic, fall = np.bincount(island, square), np.bincount(island) * (GRAVITY * dt) ** 2
-    rests = (kinetic < SLOW * fall) & (np.bincount(island[a], minlength=len(fall)) > 1)
+    rests = (kinetic < SLOW * fall) & (np.bincount(island) > 1)
     return {(i, j) for i, j in zip(a[rests[island[a]]].tolist(), b[rests[island[a]]].tolist())}
 
 

@@ -135,7 +135,10 @@ def beside(guest, **law):
 
 @pytest.mark.parametrize(
     ("guest", "law"),
-    [("roller", {}), ("mixed bed", {}), ("pendulum", {}), ("roller", {"rolling": 0.002}), ("roller", {"restitution": 0.5})],
+    [
+        ("roller", {}), ("roller", {"rolling": 0.002}), ("roller", {"restitution": 0.5}), ("mixed bed", {}),
+        ("pendulum", {}),
+    ],
 )
 def test_a_column_is_at_rest_whatever_moves_beside_it(guest, law):
     sim, share = pctt.Simulation(beside(guest, **law)), []
