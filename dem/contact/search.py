@@ -15,9 +15,10 @@ from dem.contact.ahead import Course
 from dem.contact.candidates import meeting
 from dem.contact.lists import Lists, grain_lists
 from dem.contact.primitives import extents, touches, touches_ahead
+from dem.model.images import Images, refuse_short
 from dem.model.neighbourhood import Neighbourhood, refreshed
-from dem.model.period import Images, refuse_short
 from dem.model.world import World
+from dem.parts.cell import Cell
 from dem.quaternion import cross, length
 from dem.unconstrained import UnconstrainedMotion
 from dem.unconstrained.drives import free_directions, free_turns
@@ -81,12 +82,12 @@ class Contacts:
         way = position[self.b] - position[self.a]
         return way if self.moved is None else way + self.moved
 
-    def flow(self, world: World, position: Floats) -> Floats | None:
+    def flow(self, cell: Cell, position: Floats) -> Floats | None:
         """What the cell adds to the velocities of b relative to a (nc, 3) in a step from these positions (rows, 3), by
-        its shear and by the rates of its periods; None: nothing [m/s]."""
-        if world.servo is None:
+        its shear and as it changes its size; None: nothing [m/s]."""
+        if not cell.deforms:
             return self.drift
-        affine: Floats = world.servo.rate * self.way(position)
+        affine: Floats = cell.rate * self.way(position)
         return affine if self.drift is None else self.drift + affine
 
     def take(self, rows: np.ndarray) -> Contacts:
@@ -113,17 +114,14 @@ def find_contacts(
     if shifts is None:
         shifts = (np.zeros_like(world.large.velocity) if free is None else dt * free.drives.free)[None]
     way = ways(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
-    way = way + cell_way(world, dt)
+    way = way + world.cell.margin(dt, world.grains)
     margin = np.maximum(np.maximum(delta / 2, way), margin)
     refuse_short(world, margin)
     lists = grain_lists(world, world.lists if lists is None else lists, margin, way)
-    base = near = refreshed(lists.near, lists.halo, world, margin)
+    base = refreshed(lists.near, lists.halo, world, margin)
     grown = _grown(base, shifts, besides)
-    pictures = lists.images
-    if pictures is not None:
-        if world.shear is not None or world.servo is not None:
-            pictures = pictures.now(world)
-        near, grown = pictures.among(base), grown[pictures.rows]
+    pictures = lists.images.now(world.cell)
+    near, grown = pictures.among(base), grown[pictures.rows]
     table = lists.table.now(near)
     i, j, reach = meeting(world, near, lists, table, delta, shifts, grown)
     if not world.pairs.touching.all():
@@ -149,11 +147,11 @@ def find_contacts(
         *(table.hulls.features, near.grains, i, j, pair, feature),
     )
     contacts = Contacts(key, a, b, body, *touch, friction, near, shifts, owned, lists, moved, linear, swing)
-    if pictures is not None:
+    if world.cell.periodic:
         contacts = _without_images(world, contacts, base, pictures)
     back = np.flatnonzero(pair[1:] <= pair[:-1])  # other shapes come behind the spheres, and touch in several points
     of_clumps = table.members is not None
-    if (len(back) or of_clumps) and lists.images is None:
+    if (len(back) or of_clumps) and not world.cell.periodic:
         first = 0 if of_clumps else int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min()))
         left = slice(first, None)
         order = contact_order(world, near, a[left], b[left], key[left])
@@ -169,15 +167,14 @@ def find_contacts(
     return replace(contacts.take(~rigid), held_overlap=-float(contacts.gap[rigid].min(initial=0.0)))
 
 
-def _motions(world: World, near: Neighbourhood, pictures: Images | None, prescribed: Floats) -> Floats:
+def _motions(world: World, near: Neighbourhood, pictures: Images, prescribed: Floats) -> Floats:
     """Velocities (rows, 6) before the step of the bodies of a neighbourhood, of prescribed ones those of the step;
     images and centres have those that a cell gives them."""
     velocity, seen = near.bodies.velocity.copy(), near.grains + near.ghosts
     velocity[seen:] = prescribed
-    if world.shear is not None and pictures is not None:
-        velocity[:seen, 0] += world.shear.speed * pictures.boundaries(np.arange(seen))
-    if world.servo is not None:
-        velocity[:seen, :3] += world.servo.rate * near.bodies.position[:seen]
+    if world.cell.moves:
+        velocity[:seen, 0] += world.cell.speed * pictures.boundaries(np.arange(seen))
+        velocity[:seen, :3] += world.cell.rate * near.bodies.position[:seen]
     return velocity
 
 
@@ -192,17 +189,6 @@ def velocities_about(contacts: Contacts, velocity: Floats, large: Floats) -> Flo
     return table
 
 
-def cell_way(world: World, dt: float) -> Floats | float:
-    """What margins (grains,) have beside the ways of the grains in dt [s]: half the way of images behind a sheared
-    boundary, as both grains of a pair have a half, and the share of a grain in the way by which a cell that changes its
-    size brings the centres of a pair together [m]."""
-    way: Floats | float = 0.0 if world.shear is None else 0.5 * dt * abs(world.shear.speed)
-    if world.servo is not None and world.servo.rate.any():
-        reach = 3.0 * bodies.bounding_radius(world.grains)  # with a margin of two radii, the greatest of `ways`
-        way = way + dt * np.abs(world.servo.rate).max() * reach
-    return way
-
-
 def _without_images(world: World, contacts: Contacts, near: Neighbourhood, images: Images) -> Contacts:
     """The contacts of a table with images as contacts of the bodies of `near`, at the place of body a and in order."""
     (a, way), (b, moved) = images.place(contacts.a), images.place(contacts.b)
@@ -210,9 +196,9 @@ def _without_images(world: World, contacts: Contacts, near: Neighbourhood, image
     if contacts.moved is not None:
         moved += contacts.moved
     found = replace(contacts, a=a, b=b, near=near, point=contacts.point - way, moved=moved)
-    if world.shear is not None:
+    if world.cell.moves:
         boundaries = images.boundaries(contacts.b) - images.boundaries(contacts.a)
-        found = replace(found, drift=np.outer(world.shear.speed * boundaries, (1.0, 0.0, 0.0)))
+        found = replace(found, drift=np.outer(world.cell.speed * boundaries, (1.0, 0.0, 0.0)))
     owner = np.minimum(a, b)
     owned = np.bincount(owner[owner < near.grains], minlength=near.grains).astype(float)
     return replace(found.take(contact_order(world, near, a, b, contacts.key)), owned=owned)

@@ -39,7 +39,8 @@ def change(world: World, what: str, **values: Any) -> None:
         raise ValueError(f"{what!r}: allowed are {', '.join(KINDS[:-1])} with a name, and cell" + nearest(kind, KINDS))
     refuse_functions(what, values)
     if kind == "cell":
-        _change_cell(world, **values)
+        _refuse_others(what, values, world.cell.CHANGED)
+        world.cell = world.cell.changed(world.time, **values)
     elif kind == "body":
         _change_body(world, name, **values)
     else:
@@ -136,28 +137,6 @@ def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: 
     if np.abs(place - position).max() > 1e-9 * size or abs(turned @ orientation) < 1.0 - 1e-9:
         raise ValueError(f"{type(motion).__name__} does not displace the pose at time zero: the body would jump")
     return start
-
-
-# -- the cell ------------------------------------------------------------------------------------------------
-
-
-def _change_cell(world: World, **values: Any) -> None:
-    """Shear the cell at another rate [1/s], ask for other stresses (3,) [Pa], or compress it at other rates (3,) [1/s],
-    in the place of stresses, from now on; None: none along an axis. ValueError if the scene has none of its kind."""
-    _refuse_others("cell", values, ("shear_rate", "stress", "strain_rate"))
-    shear, servo = world.shear, world.servo
-    if "shear_rate" in values:
-        if shear is None:
-            raise ValueError("shear_rate: the cell of this scene is not sheared; give the Scene a shear_rate, or 0")
-        shear = dataclasses.replace(shear, rate=float(checks.finite("shear_rate", values["shear_rate"])))
-    for name in ("stress", "strain_rate"):
-        if name in values and servo is None:
-            raise ValueError(f"{name}: the periods of this cell are constant; give the Scene a stress or a strain_rate")
-    if servo is not None and "stress" in values:
-        servo = dataclasses.replace(servo, asked=checks.stress(values["stress"]))
-    if servo is not None and "strain_rate" in values:
-        servo = dataclasses.replace(servo, strain=checks.strain_rate(values["strain_rate"]), start=world.time)
-    world.shear, world.servo = shear, servo
 
 
 # -- checkpoints ---------------------------------------------------------------------------------------------

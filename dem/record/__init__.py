@@ -18,7 +18,6 @@ from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
 from dem.exchange import reduced
 from dem.experiment import Experiment
-from dem.model.period import wrapped
 from dem.model.world import World
 from dem.motion import Held
 from dem.start import stiffness
@@ -83,20 +82,13 @@ def passages(world: World) -> dict[str, float]:
 
 
 def cell(step: Step) -> dict[str, float]:
-    """The periods at the end of the step, and the stress of its contacts and grains; nothing of a scene that is neither
-    sheared nor has a servo, or has a direction without a period."""
-    world, period = step.world, step.world.period
-    if period is None or np.isinf(period).any() or (world.shear is None and world.servo is None):
-        return {}
-    stress = cell_stress(world, step.contacts, step.force)
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    out = {f"period_{axis} [m]": float(period[k]) for k, axis in enumerate("xyz")}
-    return out | {f"stress_{'xyz'[i]}{'xyz'[j]} [Pa]": 0.5 * float(stress[i, j] + stress[j, i]) for i, j in pairs}
+    """The size of the cell at the end of the step, and the stress of its contacts and grains."""
+    return step.world.cell.record(lambda: cell_stress(step.world, step.contacts, step.force))
 
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
-    place = wrapped(step.world.grains.position, step.world.period, step.world.shear)
+    place = step.world.cell.wrapped(step.world.grains.position)
     return step.total(outside_of(place, np.asarray(low, float), np.asarray(high, float)))
 
 

@@ -13,9 +13,8 @@ from dem.arrays import Bools, Floats
 from dem.bodies import PLANE, SPHERE, Bodies
 from dem.contact.primitives import primitives, touches
 from dem.geometry.insertion import inserted
-from dem.model.neighbourhood import Neighbourhood, image_ways, touched
+from dem.model.neighbourhood import Neighbourhood, touched
 from dem.model.partition import redistribute
-from dem.model.period import wrapped
 from dem.model.world import World
 from dem.parts.sources import MOST_IDS, Source, bounds, reach
 from dem.record import energy
@@ -35,7 +34,7 @@ def come_and_go(world: World) -> None:
 
 def _leave(world: World) -> None:
     grains = world.grains
-    position, left = wrapped(grains.position, world.period), np.zeros(len(grains), bool)
+    position, left = world.cell.wrapped(grains.position), np.zeros(len(grains), bool)
     sums = np.zeros((len(world.outlets), 3))
     for row, outlet in enumerate(world.outlets.values()):
         mine = outlet.takes(position) & ~left
@@ -90,9 +89,8 @@ def _about(world: World, sources: list[Source]) -> tuple[Floats, Floats]:
     boxes = np.array([bounds(source.region) for source in sources])
     largest = np.array([reach(source.extremes()).max() for source in sources])
     boxes += np.array([-1.0, 1.0])[None, :, None] * largest[:, None, None]
-    position, radius = wrapped(world.grains.position, world.period), reach(world.grains)
-    ways = [np.zeros(3)] if world.period is None else [np.zeros(3), *image_ways(world.period)[0]]
-    found = [touched(position + way, radius, boxes[None])[0] for way in ways]
+    position, radius = world.cell.wrapped(world.grains.position), reach(world.grains)
+    found = [touched(position + way, radius, boxes[None])[0] for way in world.cell.ways]
     rows = np.unique(np.concatenate(found)).astype(np.int64)
     parts = world.comm.gather((world.grains.id[rows], position[rows], radius[rows]))
     if parts is None:
@@ -112,7 +110,7 @@ def _born(world: World, name: str, center: Floats, radius: Floats) -> tuple[list
         place = source.places(name, tally.count + np.arange(count))
         table = table.take(slice(0, count))
         size = reach(table)
-        taken = inserted(place, _free(world, place, size), size, center, radius, world.period)
+        taken = inserted(place, _free(world, place, size), size, center, radius, world.cell.period)
         came = int((taken >= 0).sum())
         table = table.take(slice(0, came))
         table.position = place[np.arange(came), taken[:came]]
@@ -131,8 +129,7 @@ def _free(world: World, place: Floats, radius: Floats) -> Bools:
     free = np.ones(place.shape[:2], bool)
     if not len(world.large) or not free.size:
         return free
-    ways = [np.zeros(3)] if world.period is None else [np.zeros(3), *image_ways(world.period)[0]]
-    for way in ways:
+    for way in world.cell.ways:
         free &= _apart(world, place.reshape(-1, 3) + way, np.repeat(radius, place.shape[1])).reshape(free.shape)
     return free
 

@@ -247,7 +247,7 @@ def _load(scene: Scene, pressed: Pressing) -> Floats:
     the strongest cohesion (n,) [N]."""
     every, gravity = scene.expected(), math.hypot(*scene.gravity)
     pull = scene.pairs(np.inf).cohesion.max()
-    pressure = 0.0 if scene.stress is None else float(np.nan_to_num(scene.stress).max())
+    pressure = scene.cell.pressure
     if gravity > 0.0:
         down = np.asarray(scene.gravity) / gravity
         pressure = max(_pressure(scene, gravity, down), _bed(scene, gravity, down))

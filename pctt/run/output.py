@@ -24,7 +24,6 @@ from mpi4py import MPI
 from dem import bodies
 from dem.exchange import exchange
 from dem.experiment import Experiment
-from dem.model.period import lattice, velocity_in_cell, wrapped
 from dem.model.world import World
 from dem.motion import Dynamic
 from dem.scene import least_half
@@ -211,10 +210,7 @@ class Writer:
         }
         if (moments := step.moments) is not None:
             rows["contact/moment"] = moments
-        top: dict[str, Any] = {"step": world.step, "time": world.time}
-        if world.period is not None:
-            top["lattice"], top["drift"] = lattice(world.period, world.shear)
-            top["rate"] = np.zeros(3) if world.servo is None else world.servo.rate
+        top = {"step": world.step, "time": world.time, **world.cell.attributes()}
         about = {"/": top, "record": row, "contact": {"dt": step.system.dt}}
         write_rows(frames / f"{world.step:06d}.h5", self.comm, rows, {}, about)
         self._recorded = world.step
@@ -327,12 +323,8 @@ def described_forms(world: World) -> list[dict[str, Any]]:
 
 def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Columns of the table of all bodies, in the order of their ids, spread over the ranks; collective."""
-    grains, comm = world.grains, world.comm
+    grains, comm = world.cell.inside(world.grains), world.comm
     columns = {"id": grains.id, **{name: getattr(grains, name) for name in names}}
-    if "position" in columns:
-        if "velocity" in columns:
-            columns["velocity"] = velocity_in_cell(columns["position"], columns["velocity"], world.shear)
-        columns["position"] = wrapped(columns["position"], world.period, world.shear)
     starts = np.arange(comm.size + 1) * world.ids // comm.size
     rows = exchange(comm, columns, np.searchsorted(starts, grains.id, side="right") - 1)
     order, last = np.argsort(rows["id"]), comm.rank == comm.size - 1

@@ -13,8 +13,8 @@ from mpi4py import MPI
 from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
 from dem.exchange import reduced
+from dem.model.images import put_back
 from dem.model.partition import rebalance
-from dem.model.period import put_back
 from dem.model.world import World
 from dem.record.passage import come_and_go
 from dem.step import Step, advance, carried, find_overrun, find_turned
@@ -65,7 +65,7 @@ class Stepper:
         self._slabs: Ints | None = None  # those of the last step, whose impulses the memory has
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
-        if world.servo is not None and not np.isfinite(world.pairs.stiffness).all():
+        if world.cell.deforms and not np.isfinite(world.pairs.stiffness).all():
             raise OptionError("-stiffness inf: a cell of given stress needs contacts that give way; allowed is less")
 
     def __enter__(self) -> Stepper:
