@@ -175,11 +175,10 @@ class Cell(Named):
 
     def beside_flow(self, position: Floats, velocity: Floats) -> Floats:
         """Linear velocities (n, 3) beside those of the shear at these positions (n, 3) [m/s]."""
-        if self.gradient is None:
-            return velocity
-        velocity = velocity.copy()
-        velocity[:, 0] -= self.shear_rate * position[:, self.gradient]
-        return velocity
+        beside = velocity.copy()
+        if self.gradient is not None:
+            beside[:, 0] -= self.shear_rate * position[:, self.gradient]
+        return beside
 
     def margin(self, dt: float, grains: Bodies) -> Floats | float:
         """What the margins (n,) of grains have beside their ways in dt [s]: half the way of images
