@@ -30,7 +30,7 @@ from dem.parts import cell, contact_law
 from dem.parts.contact_law import ContactLaw
 from dem.parts.joints import Joint
 from dem.parts.loads import Law, Load, On
-from dem.parts.sources import MOST_IDS, Outlet, Source
+from dem.parts.sources import Outlet, Passages, Source
 from dem.parts.springs import End, Spring
 from dem.quaternion import across, length
 from dem.shapes import Clump, Shape, clumps, polyhedra
@@ -166,8 +166,7 @@ class Scene:
         self.forms: list[Form] = []  #: the distinct shapes of clumps and polyhedra, see `dem.bodies`
         self.loads: dict[str, Load] = {}  #: by name
         self.springs: dict[str, Spring] = {}  #: by name
-        self.sources: dict[str, Source] = {}  #: by name
-        self.outlets: dict[str, Outlet] = {}  #: by name
+        self.passages = Passages()  #: sources and outlets
         self.joints: dict[str, Joint] = {}  #: by name
 
     def add_spheres(
@@ -431,28 +430,21 @@ class Scene:
     def add_source(self, name: str, region: Block | Cylinder, *, material: str = "default", **given: Any) -> None:
         """Let grains come in a region of `dem.measures`, where there is room; `given` are the fields of
         `dem.parts.sources.Source`: radius [m], density [kg/m^3], mass_rate [kg/s] or number_rate [1/s], and others."""
-        self._refuse_passage(name)
-        self.sources[name] = Source(region, material=self._material(material), **given)
+        self.passages.add(name, Source(region, material=self._material(material), **given))
 
     def add_outlet(self, name: str, region: Block | Cylinder, *, outside: bool = False) -> None:
         """Let grains leave whose centres are in a region of `dem.measures`; `outside`: those that are not in it."""
-        self._refuse_passage(name)
-        self.outlets[name] = Outlet(region, outside)
-
-    def _refuse_passage(self, name: str) -> None:
-        if not name or set(name) & set(',"\n') or name in {**self.sources, **self.outlets}:
-            raise ValueError(f"sources and outlets need distinct names without commas, got {name!r}")
+        self.passages.add(name, Outlet(region, outside))
 
     @property
     def first_large(self) -> int:
         """The id of the first large body: more than that of any grain that may come."""
-        return MOST_IDS if self.sources else self.count
+        return self.passages.first_large(self.count)
 
     @property
     def kinds(self) -> list[int]:
-        """The kinds of grains that there are, or that sources may add, as of `dem.bodies`."""
-        later = (source.extremes().shape.tolist() for source in self.sources.values())
-        return sorted({part.kind for part in self.parts}.union(*later))
+        """The kinds of grains that there are, or that may come, as of `dem.bodies`."""
+        return sorted({part.kind for part in self.parts} | {*self.passages.extremes().shape.tolist()})
 
     @property
     def count(self) -> int:
@@ -471,11 +463,10 @@ class Scene:
         return np.hypot(np.hypot(x, y), z)  # squares could overflow
 
     def expected(self) -> Bodies:
-        """Grains that stand for those of time zero, see `Survey`, and those of sources: of each the smallest and the
-        largest that may come. A scene without both has its large bodies that forces move, as spheres that fit into
-        their shapes. ValueError as of `grains`."""
+        """Grains that stand for those of time zero, see `Survey`, and for those that may come. A scene without both has
+        its large bodies that forces move, as spheres that fit into their shapes. ValueError as of `grains`."""
         self.grains(0, 0)
-        found = bodies.concatenate([self.survey().extremes, *(s.extremes() for s in self.sources.values())])
+        found = bodies.concatenate([self.survey().extremes, self.passages.extremes()])
         return found if len(found) else self._free()
 
     def _free(self) -> Bodies:
@@ -516,11 +507,11 @@ class Scene:
     def grains(self, first: int = 0, end: int | None = None) -> Bodies:
         """The grains from the id `first` on and before `end`, all by default. ValueError if there is nothing that
         moves."""
-        later = [source.extremes() for source in self.sources.values()]
+        later = self.passages.extremes()
         if self.count + len(later) + len(self._free()) == 0:
             raise ValueError("empty scene: there is no grain, and no large body that forces move")
         if self.cell.periodic:
-            tables = [self.survey().extremes, *later]
+            tables = self.survey().extremes, later
             _refuse_in_cell(self, max(float(bodies.bounding_radius(t).max(initial=0.0)) for t in tables))
         return self._rows(first, self.count if end is None else end)
 
@@ -694,9 +685,8 @@ def _refuse_in_cell(scene: Scene, radius: float) -> None:
         what = "cell of given stress" if scene.cell.deforms else "sheared cell"
         if scene.large_bodies:
             raise ValueError(f"large body {scene.large_bodies[0].name!r}: a {what} has grains alone")
-        if scene.sources or scene.outlets:
-            name = next(iter({**scene.sources, **scene.outlets}))
-            raise ValueError(f"{name!r}: a {what} has no sources and outlets")
+        if scene.passages:
+            raise ValueError(f"{scene.passages.names[0]!r}: a {what} has no sources and outlets")
         if scene.joints:
             raise ValueError(f"joint {next(iter(scene.joints))!r}: a {what} has no joints")
     if scene.springs:

@@ -354,7 +354,7 @@ sim.run(until=1.0)
 shoulder = sim.joint("shoulder")
 print(f"angle {shoulder.angle:.3f} rad after 1 s at 0.5 rad/s, torque of the motor {shoulder.drive:.2f} N m")
 
-# %% dem.parts.sources.Source, dem.parts.sources.Outlet, dem.parts.sources.Tally
+# %% dem.parts.sources.Source, dem.parts.sources.Outlet, dem.parts.sources.Tally, dem.parts.sources.Passages
 import pctt
 from dem.measures import Block
 from dem.scene import Scene
@@ -366,6 +366,7 @@ scene.add_outlet("drain", below)
 sim = pctt.Simulation(scene, dt=0.005, solver="apgd")
 sim.run(until=1.0)
 print(sim.source("feed").count, "came,", sim.outlet("drain").count, "left,", len(sim.ids), "are there")
+print("counted are", ", ".join(sim.world.passages.names))
 
 # %% dem.parts.sources.Uniform, dem.parts.sources.Listed
 from dem.parts.sources import Listed, Uniform

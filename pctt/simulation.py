@@ -16,7 +16,7 @@ import dataclasses
 import html
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -248,17 +248,12 @@ class Simulation:
     def source(self, name: str) -> Tally:
         """What has come from a source: ``count``, ``mass`` [kg], and ``refused``, the steps in which it had no room.
         ValueError if there is none of that name. Not collective."""
-        return self._passage("source", self.world.sources, name)
+        return self.world.passages.passed("source", name)
 
     def outlet(self, name: str) -> Tally:
         """What has left by an outlet: ``count`` and ``mass`` [kg]. ValueError if there is none of that name. Not
         collective."""
-        return self._passage("outlet", self.world.outlets, name)
-
-    def _passage(self, what: str, there: Mapping[str, Any], name: str) -> Tally:
-        if name not in there:
-            raise ValueError(f"no {what} {name!r}; there are: {', '.join(there) or 'none'}")
-        return dataclasses.replace(self.world.tallies[name])
+        return self.world.passages.passed("outlet", name)
 
     @property
     def positions(self) -> Floats:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from dem.parts.named import Named
 from dem.scene import LargeBody, checked_surface
 
 #: The fields of a `World` that have parts by their names, by what a part is called.
-PARTS = {"load": "loads", "spring": "springs", "joint": "joints", "source": "sources"}
+PARTS = {"load": "loads", "spring": "springs", "joint": "joints", "source": "passages.sources"}
 KINDS = (*PARTS, "body", "cell")
 
 
@@ -55,7 +56,7 @@ def refuse_functions(what: str, values: Mapping[str, Any]) -> None:
 
 
 def _change_part(world: World, kind: str, name: str, **values: Any) -> None:
-    there: dict[str, Named] = getattr(world, PARTS[kind])
+    there: dict[str, Named] = attrgetter(PARTS[kind])(world)
     part = there.get(name)
     if part is None and kind == "load" and "on" in values:
         part = Load(values["on"])
@@ -63,13 +64,13 @@ def _change_part(world: World, kind: str, name: str, **values: Any) -> None:
         begins = "; give on=... to begin one" * (kind == "load")
         raise ValueError(f"no {kind} {name!r}; there are: {', '.join(there) or 'none'}{nearest(name, there)}{begins}")
     _refuse_others(f"{kind} {name!r}", values, part.CHANGED)
-    _put(world, kind, name, part.changed(world.time, world.tallies.get(name), **values))
+    _put(world, kind, name, part.changed(world.time, world.passages.tallies.get(name), **values))
 
 
 def _put(world: World, kind: str, name: str, part: Named) -> None:
     if isinstance(part, Load):
         refuse_load(world, name, part)
-    getattr(world, PARTS[kind])[name] = part
+    attrgetter(PARTS[kind])(world)[name] = part
     world.changed.add((kind, name))
 
 
@@ -149,7 +150,7 @@ def changes(world: World) -> str:
         if kind == "body":
             entry = _entry(world.large_bodies[world.large_row(name)])
         else:
-            part = getattr(world, PARTS[kind])[name]
+            part = attrgetter(PARTS[kind])(world)[name]
             entry = {key: getattr(part, key) for key in part.KEPT}
         found.setdefault(kind, {})[name] = {key: value for key, value in entry.items() if not callable(value)}
     return json.dumps(found, default=lambda array: array.tolist())
@@ -162,7 +163,7 @@ def restore(world: World, text: str) -> None:
             if kind == "body":
                 world.replace_large(_restored(world.large_bodies[world.large_row(name)], entry))
                 continue
-            there = getattr(world, PARTS[kind])
+            there = attrgetter(PARTS[kind])(world)
             if name not in there and kind != "load":
                 raise ValueError(f"the scene has no {kind} {name!r}")
             part = there.get(name) or Load(None)

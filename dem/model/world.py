@@ -18,7 +18,7 @@ from dem.parts.cell import OPEN, Cell
 from dem.parts.contact_law import ContactLaw
 from dem.parts.joints import Joint
 from dem.parts.loads import Load
-from dem.parts.sources import Outlet, Source, Tally, as_array
+from dem.parts.sources import Passages
 from dem.parts.springs import Spring
 from dem.scene import LargeBody
 from dem.shapes.forms import Form
@@ -26,7 +26,7 @@ from dem.together import together
 
 #: The fields of a world that a step changes; what these refer to is replaced, and never changed in place.
 STATE = (
-    "grains", "large", "slabs", "only_spheres", "lists", "expected", "cell", "tallies", "time", "step", "spare",
+    "grains", "large", "slabs", "only_spheres", "lists", "expected", "cell", "passages", "time", "step", "spare",
 )  # fmt: skip
 
 
@@ -52,9 +52,7 @@ class World:
     #: pairs of ids, the lower + 1j the upper, of bodies that joints join and that do not touch each other
     apart: Keys = field(default_factory=lambda: np.zeros(0, complex))
     cell: Cell = OPEN
-    sources: dict[str, Source] = field(default_factory=dict)  #: by name
-    outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
-    tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets, by name
+    passages: Passages = field(default_factory=Passages)  #: where grains come and go
     forms: tuple[Form, ...] = ()  #: shapes of grains, by their numbers
     initial: int = 0  #: number of grains at time zero
     first_large: int = 0  #: id of the first large body
@@ -79,7 +77,6 @@ class World:
         """A world that a step may change: this one stays as it is until it takes its state."""
         other = copy(self)
         other.grains, other.large = dataclasses.replace(self.grains), dataclasses.replace(self.large)
-        other.tallies = {name: dataclasses.replace(tally) for name, tally in self.tallies.items()}
         return other
 
     def take(self, trial: World) -> None:
@@ -95,9 +92,7 @@ class World:
         if self.expected is not None:
             replicated["expected"] = self.expected
         replicated["spare"] = np.array(self.spare)
-        if self.tallies:
-            replicated["tallies"] = as_array(self.tallies)
-        return self.grains.columns(), replicated | self.cell.state()
+        return self.grains.columns(), replicated | self.passages.state() | self.cell.state()
 
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
@@ -110,7 +105,7 @@ class World:
     @property
     def ids(self) -> int:
         """Number of grains that there have been; their ids are less."""
-        return self.initial + sum(self.tallies[name].count for name in self.sources)
+        return self.initial + self.passages.came
 
     @property
     def body_count(self) -> int:

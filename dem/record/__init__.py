@@ -18,7 +18,6 @@ from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
 from dem.exchange import reduced
 from dem.experiment import Experiment
-from dem.model.world import World
 from dem.motion import Held
 from dem.start import stiffness
 from dem.step import Step
@@ -31,7 +30,7 @@ def row(step: Step, scene: Experiment) -> dict[str, float]:
     """All quantities of a step by name, with units in brackets. SceneError if the scene's `record` fails or returns
     something else than numbers by name."""
     out = {"step": step.world.step, "time [s]": step.world.time}
-    out |= energy_balance(step) | contact_statistics(step) | passages(step.world)
+    out |= energy_balance(step) | contact_statistics(step) | step.world.passages.record()
     out |= cell(step)
     if scene.domain is not None:
         out["grains_outside"] = outside(step, *scene.domain)
@@ -65,20 +64,6 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
     if most != -least:
         raise SceneError(f"{what}: it must return the same names on all ranks, in the same order")
     return own
-
-
-def passages(world: World) -> dict[str, float]:
-    """What has passed each source and outlet up to now, how many steps a source had no room, and the energies that
-    came and went with grains before this step [J]; nothing of a scene without."""
-    out: dict[str, float] = {}
-    for name, tally in world.tallies.items():
-        out |= {f"count_{name}": tally.count, f"mass_{name} [kg]": tally.mass}
-        if name in world.sources:
-            out[f"refused_{name}"] = tally.refused
-    if out:
-        for kind, names in (("sources", world.sources), ("outlets", world.outlets)):
-            out[f"energy_of_{kind} [J]"] = sum(world.tallies[name].energy for name in names)
-    return out
 
 
 def cell(step: Step) -> dict[str, float]:

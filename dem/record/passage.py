@@ -26,24 +26,25 @@ PART = 256  #: grains that are placed at once
 def come_and_go(world: World) -> None:
     """Let grains leave and come, as they are due at the time of the world; collective. SceneError for a source that has
     used up all ids."""
-    if world.outlets:
+    world.passages = world.passages.counted()
+    if world.passages.outlets:
         _leave(world)
-    if world.sources:
+    if world.passages.sources:
         _come(world)
 
 
 def _leave(world: World) -> None:
     grains = world.grains
     position, left = world.cell.wrapped(grains.position), np.zeros(len(grains), bool)
-    sums = np.zeros((len(world.outlets), 3))
-    for row, outlet in enumerate(world.outlets.values()):
+    sums = np.zeros((len(world.passages.outlets), 3))
+    for row, outlet in enumerate(world.passages.outlets.values()):
         mine = outlet.takes(position) & ~left
         left |= mine
         table = grains.take(mine)
         sums[row] = len(table), table.mass.sum(), sum(energy(table, world.gravity))
     world.comm.Allreduce(MPI.IN_PLACE, sums)
-    for name, (count, mass, joule) in zip(world.outlets, sums):
-        tally = world.tallies[name]
+    for name, (count, mass, joule) in zip(world.passages.outlets, sums):
+        tally = world.passages.tallies[name]
         tally.count, tally.mass, tally.energy = tally.count + int(count), tally.mass + float(mass), float(joule)
     if sums[:, 0].any():
         world.set_grains(grains.take(~left))
@@ -51,19 +52,19 @@ def _leave(world: World) -> None:
 
 def _come(world: World) -> None:
     comm, ids = world.comm, world.ids
-    wanted = comm.bcast([name for name in world.sources if _due(world, name, PART)[1]])
-    for name in world.sources:
-        world.tallies[name].energy = 0.0
+    wanted = comm.bcast([name for name in world.passages.sources if _due(world, name, PART)[1]])
+    for name in world.passages.sources:
+        world.passages.tallies[name].energy = 0.0
     if not wanted:
         return
-    center, radius = _about(world, [world.sources[name] for name in wanted])
+    center, radius = _about(world, [world.passages.sources[name] for name in wanted])
     born: list[Bodies] = []
     if comm.rank == 0:
         for name in wanted:
             found, center, radius = _born(world, name, center, radius)
             born += found
-    tallies, count = comm.bcast(({name: world.tallies[name] for name in wanted}, sum(map(len, born))))
-    world.tallies |= tallies
+    tallies, count = comm.bcast(({name: world.passages.tallies[name] for name in wanted}, sum(map(len, born))))
+    world.passages.tallies.update(tallies)
     if ids + count > MOST_IDS:
         raise SceneError(f"step {world.step + 1}: sources have made more than {MOST_IDS} grains, which have no ids")
     if count:
@@ -78,7 +79,7 @@ def _come(world: World) -> None:
 
 def _due(world: World, name: str, most: int) -> tuple[Bodies, int]:
     """The next grains of a source, so many at most, and how many of them are due."""
-    source, tally = world.sources[name], world.tallies[name]
+    source, tally = world.passages.sources[name], world.passages.tallies[name]
     table = source.grains(name, tally.count + np.arange(most))
     return table, source.due(world.time, tally, table.mass)
 
@@ -104,7 +105,7 @@ def _born(world: World, name: str, center: Floats, radius: Floats) -> tuple[list
     """The grains that a source adds now among spheres of centres (m, 3) and radii (m,), and all of these spheres then;
     counted in the tally. Where the next grain finds no place, it and all after it wait, so that sizes keep their
     shares."""
-    source, tally, born = world.sources[name], world.tallies[name], []
+    source, tally, born = world.passages.sources[name], world.passages.tallies[name], []
     while True:
         table, count = _due(world, name, PART)
         place = source.places(name, tally.count + np.arange(count))

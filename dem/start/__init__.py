@@ -20,7 +20,6 @@ from dem.model.changes import refuse_load
 from dem.model.images import put_back
 from dem.model.partition import redistribute
 from dem.model.world import World
-from dem.parts.sources import Tally, from_array
 from dem.scene import Scene, least_half
 from dem.shapes.forms import Form
 from dem.start import stiffness
@@ -61,9 +60,10 @@ def restored_world(
     ]
     refuse(comm, f"arrays of other shapes or types: {', '.join(other)}" if other else "")
     world = _world(scene, comm, Bodies(**{name: np.array(column) for name, column in local.items()}))
-    if world.tallies:
-        world.tallies = from_array([*world.tallies], np.array(replicated.get("tallies", ())))
-    count = world.ids - sum(world.tallies[name].count for name in world.outlets)
+    for part in ("passages", "cell"):
+        restored = partial(getattr(world, part).restored, replicated)
+        setattr(world, part, together(comm, f"restored {part}", restored, own=(ValueError,)))
+    count = world.ids - world.passages.left
     if world.slabs[-1] != count or len(large["id"]) != len(world.large):
         raise ValueError(
             f"the state has {world.slabs[-1]} grains and {len(large['id'])} large bodies, "
@@ -74,7 +74,6 @@ def restored_world(
     expected = np.array(replicated["expected"]) if "expected" in replicated else None
     world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
     world.spare = float(replicated["spare"])
-    world.cell = together(comm, "restored", partial(world.cell.restored, replicated), own=(ValueError,))
     _refuse_impossible(world)
     if len(replicated["slabs"]) != comm.size + 1:
         redistribute(world)
@@ -106,7 +105,7 @@ def _refuse_impossible(world: World) -> None:
     owner = np.clip(np.searchsorted(starts, world.grains.id, side="right") - 1, 0, world.comm.size - 1)
     ids = np.sort(exchange(world.comm, {"id": world.grains.id}, owner)["id"])
     most = starts[world.comm.rank : world.comm.rank + 2]
-    missing = not world.outlets and len(ids) != most[1] - most[0]
+    missing = not world.passages.left and len(ids) != most[1] - most[0]
     if missing or (np.diff(ids) <= 0).any() or ((ids < most[0]) | (ids >= most[1])).any():
         wrong.append("id of a grain")
     refuse(world.comm, f"a state that no run can have: {', '.join(wrong)}" if wrong else "")
@@ -136,12 +135,11 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     world.loads, world.springs, world.cell = dict(scene.loads), dict(scene.springs), scene.cell
     world.forms = tuple(scene.forms)
     refuse_untouchable(scene.kinds, scene.large_bodies)
-    world.sources, world.outlets = dict(scene.sources), dict(scene.outlets)
-    world.tallies = {name: Tally() for name in (*world.sources, *world.outlets)}
+    world.passages = scene.passages.counted()
     world.initial, world.first_large = scene.count, scene.first_large
     for what, members in (("spring", world.springs), ("joint", scene.joints)):
         tied = [name for name, member in members.items() if any(isinstance(end, int) for end in member.ends)]
-        if tied and world.outlets:
+        if tied and world.passages.outlets:
             raise ValueError(f"{what} {tied[0]!r} holds a grain: with outlets {what}s may hold large bodies alone")
     world.joints = dict(scene.joints)
     number = {body.name: int(id) for body, id in zip(world.large_bodies, world.large.id)}

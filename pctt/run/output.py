@@ -142,7 +142,7 @@ class Writer:
         self._kept_steps = world.step if place.goes_on else 0
         self._begun = self._stands = self._stale = False
         self.analysis: dict[str, float] | None = None  #: the scene's numbers of all steps so far
-        tables = [world.grains, *(source.extremes() for source in world.sources.values())]
+        tables = world.grains, world.passages.extremes()
         smallest = min(float(bodies.least_half_thickness(table).min(initial=np.inf)) for table in tables)
         radius = self.comm.allreduce(smallest, MPI.MIN)
         if np.isinf(radius):
@@ -199,7 +199,7 @@ class Writer:
                 write_rows(table, self.comm, rows, shared, {})
         near = contacts.near.bodies
         rows = {
-            **_by_id(world, (*PLACES, *(TABLE if world.tallies else ()))),
+            **_by_id(world, (*PLACES, *(TABLE if world.passages else ()))),
             "contact/key": contacts.key,
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
             "contact/point": step.point,

@@ -68,7 +68,7 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     large = scene.large_bodies
     motions = [(body.name, type(body.motion).__name__) for body in large]
     words: list[Any] = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
-    words += [repr(scene.sources), repr(scene.outlets)]
+    words.append(repr(scene.passages))
     words.append([(part.count, part.kind, part.material) for part in scene.parts])
     words.append([(name, repr(joint)) for name, joint in scene.joints.items()])
     numbers: list[Any] = [column.sample() for part in scene.parts for column in part.given.values()]

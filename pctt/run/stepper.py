@@ -98,7 +98,7 @@ class Stepper:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
         given, found, result, eased, smooth, turned, shown = self.settings, None, None, None, False, 0, 0
         with log.phase("search"):
-            come_and_go(world)  # outlets take, sources add
+            come_and_go(world)  # grains that leave, and those that are due
             put_back(world)  # into the periodic cell
             rebalance(world)
             free = unconstrained(world, given.dt)  # gravity, spin, loads, springs, drives, motions

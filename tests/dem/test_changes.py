@@ -42,7 +42,7 @@ CHANGES = {
 
 
 def all_of(world):
-    parts = [world.loads, world.springs, world.joints, world.sources, {b.name: b for b in world.large_bodies}]
+    parts = [world.loads, world.springs, world.joints, world.passages.sources, {b.name: b for b in world.large_bodies}]
     return repr([vars(part) for named in parts for part in named.values()])
 
 
