@@ -55,6 +55,11 @@ class Cell(Named):
         return bool(self.axes.any())
 
     @property
+    def _lengths(self) -> Floats:
+        """The periods (3,); 0: none [m]."""
+        return np.where(self.axes, self.period, 0.0)
+
+    @property
     def moves(self) -> bool:
         """Whether images move beside their bodies, by a shear or as the cell changes its size."""
         return self.gradient is not None or self.deforms
@@ -83,10 +88,8 @@ class Cell(Named):
         out = position.copy()
         if self.gradient is not None:
             out[:, 0] -= self._crossed(position) * self.shift
-        for k in np.flatnonzero(self.axes):
-            length = self.period[k]
-            out[:, k] -= length * np.floor(out[:, k] / length)
-            out[out[:, k] >= length, k] = 0.0  # a negative number that rounding makes a whole period
+        out -= self._lengths * np.floor(out / self.period)
+        out[out >= self.period] = 0.0  # a negative number that rounding makes a whole period
         return out
 
     def inside(self, table: Bodies) -> Bodies:
@@ -113,9 +116,7 @@ class Cell(Named):
 
     def whole(self, way: Floats) -> Floats:
         """The part (..., 3) of ways (..., 3) that is whole periods [m]; without it, ways lead to the nearest image."""
-        axes = self.axes
-        length = np.where(axes, self.period, 1.0)
-        return np.where(axes, length * np.round(way / length), 0.0)
+        return self._lengths * np.round(way / self.period)
 
     def images(self) -> tuple[Floats, Floats]:
         """By how many periods (k, 3) a body and its images about the cell are moved, and how many sheared boundaries
@@ -140,7 +141,7 @@ class Cell(Named):
 
     def moved(self, steps: Floats, across: Floats) -> Floats:
         """The ways (k, 3) by so many periods (k, 3) and over so many sheared boundaries (k,) [m]."""
-        way = steps * np.where(self.axes, self.period, 0.0)
+        way = steps * self._lengths
         way[:, 0] += across * self.shift
         return way
 
@@ -148,7 +149,7 @@ class Cell(Named):
     def lattice(self) -> tuple[Floats, Floats]:
         """The ways (3, 3) to the next images along each axis [m], and their velocities (3, 3) [m/s]; zeros along axes
         without a period. Sheared images are the nearest along x."""
-        way, drift = np.diag(np.where(self.axes, self.period, 0.0)), np.zeros((3, 3))
+        way, drift = np.diag(self._lengths), np.zeros((3, 3))
         if self.gradient is not None:
             way[self.gradient, 0] = self.shift - self.period[0] * np.round(self.shift / self.period[0])
             drift[self.gradient, 0] = self.speed
