@@ -107,26 +107,3 @@ def check_fields(instance: Any, **checks: Callable[[str, Any], Floats]) -> None:
     for name, check in checks.items():
         value = check(f"{type(instance).__name__}.{name}", getattr(instance, name)).tolist()
         object.__setattr__(instance, name, tuple(value) if isinstance(value, list) else value)
-
-
-def stress(values: Any) -> Floats:
-    """Stresses (3,) [Pa], positive in compression, NaN where None stands. ValueError for bad ones."""
-    if len(values) != 3:
-        raise ValueError(f"stress must have three entries, for x, y and z, got {values}")
-    return np.array([np.nan if value is None else float(positive("stress", value)) for value in values])
-
-
-def strain_rate(values: Any) -> Floats:
-    """Strain rates (3,) [1/s], positive in compression, NaN where None stands. ValueError for bad ones."""
-    if len(values) != 3:
-        raise ValueError(f"strain_rate must have three entries, for x, y and z, got {values}")
-    return np.array([np.nan if value is None else float(finite("strain_rate", value)) for value in values])
-
-
-def period(values: Any) -> Floats | None:
-    """Lengths (3,) [m] of a periodic cell, inf where None stands; None if there is none. ValueError for bad ones."""
-    if values is None or all(value is None for value in values):
-        return None
-    if len(values) != 3:
-        raise ValueError(f"period must have three entries, for x, y and z, got {values}")
-    return np.array([np.inf if value is None else float(positive("period", value)) for value in values])

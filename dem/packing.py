@@ -11,7 +11,7 @@ from dem import checks
 from dem.arrays import Floats, Rule
 from dem.contact.broad import close_pairs
 from dem.geometry.insertion import inserted
-from dem.model.neighbourhood import image_ways
+from dem.parts.cell import Cell
 from dem.parts.sources import Listed, Uniform
 from dem.quaternion import length
 
@@ -73,30 +73,30 @@ def random_packing(
     radii = sizes.at(random.random(int(np.ceil(1.2 * wanted / (4 / 3 * np.pi * sizes.ends[0] ** 3))) + 1))
     radii = radii[: 1 + int(np.searchsorted(np.cumsum(4 / 3 * np.pi * radii**3), wanted * (1.0 - 1e-12)))]
     radii = np.sort(radii)[::-1].copy()  # large ones find no place among small ones
-    period = np.where(periodic, box, np.inf)
+    cell = Cell(np.where(periodic, box, np.inf))
     part = min((SPARSE / fraction) ** (1 / 3), 1.0)
     low = np.where(periodic, 0.0, radii[:, None])
     place = low[:, None] + random.random((len(radii), TRIES, 3)) * (box - 2.0 * low)[:, None]
     free = np.ones(place.shape[:2], bool)
-    taken = inserted(place, free, part * radii, np.zeros((0, 3)), np.zeros(0), period)
+    taken = inserted(place, free, part * radii, np.zeros((0, 3)), np.zeros(0), cell.period)
     if (taken < 0).any():
         raise ValueError(f"no place for {np.count_nonzero(taken < 0)} of {len(radii)} spheres: the box is too small")
     position, left = place[np.arange(len(radii)), taken], most
     while part < 1.0:
         part = min(1.03 * part, 1.0)
-        position, left = _apart(position, part * radii * (1.0 + SWELL), box, period, left)
+        position, left = _apart(position, part * radii * (1.0 + SWELL), box, cell, left)
     order = random.permutation(len(radii))
     return position[order], radii[order]
 
 
-def _apart(position: Floats, radius: Floats, box: Floats, period: Floats, most: int) -> tuple[Floats, int]:
+def _apart(position: Floats, radius: Floats, box: Floats, cell: Cell, most: int) -> tuple[Floats, int]:
     """The places (n, 3) of spheres moved until overlaps are less than SWELL radii, and how many of the rounds are left.
 
     Spheres that overlap are pushed apart by a part of the overlap, and go on for a part of the way of the last round.
     """
-    way, finite = np.zeros_like(position), np.isfinite(period)
+    way = np.zeros_like(position)
     for rounds in range(most, 0, -1):
-        one, other, apart = _pairs(position, radius, period)
+        one, other, apart = _pairs(position, radius, cell)
         distance = length(apart)
         reach = radius[one] + radius[other]
         deep = reach - distance
@@ -104,26 +104,24 @@ def _apart(position: Floats, radius: Floats, box: Floats, period: Floats, most: 
         shift = np.zeros_like(position)
         for k in range(3):
             shift[:, k] = np.bincount(other, push[:, k], len(position)) - np.bincount(one, push[:, k], len(position))
-        walls = np.where(finite, 0.0, np.clip(position, radius[:, None], box - radius[:, None]) - position)
+        walls = np.where(cell.axes, 0.0, np.clip(position, radius[:, None], box - radius[:, None]) - position)
         if (deep < SWELL * reach / 2.0).all() and (np.abs(walls) < SWELL * radius[:, None] / 2.0).all():
             return position, rounds
         way = 0.8 * way + 0.15 * (shift + 2.0 * walls)
-        position = position + way
-        position = np.where(finite, position - box * np.floor(position / box), position)
+        position = cell.wrapped(position + way)
     raise ValueError(f"a packing of {len(radius)} spheres still overlaps by {(deep / reach).max():.1e} of their size: "
                      "take a lower solid fraction")  # fmt: skip
 
 
-def _pairs(position: Floats, radius: Floats, period: Floats) -> tuple[Floats, Floats, Floats]:
+def _pairs(position: Floats, radius: Floats, cell: Cell) -> tuple[Floats, Floats, Floats]:
     """Rows (m,) and (m,) of spheres that touch, and the ways (m, 3) from the first to the second or its image."""
-    source, moved = [np.arange(len(position))], [np.zeros_like(position)]
-    for way in image_ways(period)[0] if np.isfinite(period).any() else ():
-        near = ((position + way > -2.0 * radius.max()) & (position + way < np.where(np.isfinite(period), period, np.inf)
-                + 2.0 * radius.max()) | ~np.isfinite(period)).all(axis=1)  # fmt: skip
+    source, moved, reach = [], [], 2.0 * radius.max()
+    for way in cell.ways:  # the first are those in the box
+        image = position + way
+        near = (((image > -reach) & (image < cell.period + reach)) | ~cell.axes).all(axis=1)
         source.append(np.flatnonzero(near))
-        moved.append(np.broadcast_to(way, (len(source[-1]), 3)))
-    row = np.concatenate(source)
-    place = position[row] + np.concatenate(moved)
+        moved.append(image[near])
+    row, place = np.concatenate(source), np.concatenate(moved)
     pairs = close_pairs(place, radius[row])
     pairs = pairs[pairs[:, 0] < len(position)]  # the first is in the box; a pair across a face is found from both
     one, other = row[pairs[:, 0]], row[pairs[:, 1]]

@@ -26,11 +26,11 @@ from dem.bodies import BOX, CAPSULE, COMPOUND, MESH, PLANE, SPHERE, Bodies
 from dem.geometry.survey import Survey, survey
 from dem.measures import Block, Cylinder
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
-from dem.parts import contact_law
+from dem.parts import cell, contact_law
 from dem.parts.contact_law import ContactLaw
-from dem.parts.joints import Joint, whole_periods
+from dem.parts.joints import Joint
 from dem.parts.loads import Law, Load, On
-from dem.parts.sources import MOST_IDS, Outlet, Source
+from dem.parts.sources import Outlet, Passages, Source
 from dem.parts.springs import End, Spring
 from dem.quaternion import across, length
 from dem.shapes import Clump, Shape, clumps, polyhedra
@@ -152,21 +152,8 @@ class Scene:
         change; None: not along that axis. `strain_rate`: (3,) at which it is compressed along x, y, z [1/s] from the
         time `strain_start` [s] on, in the place of the stress along that axis. See docs/periodic.md.
         """
-        self.period = checks.period(period)
-        self.stress = None if stress is None else checks.stress(stress)
-        self.strain_rate = None if strain_rate is None else checks.strain_rate(strain_rate)
-        self.strain_start = float(checks.not_negative("strain_start", strain_start))
-        what = "strain_rate" if stress is None else "stress"
-        if self.deforms and (self.period is None or np.isinf(self.period).any()):
-            raise ValueError(f"{what} needs periods along x, y and z")
-        if self.deforms and np.any(gravity):
-            raise ValueError(f"{what} needs gravity (0, 0, 0): in a cell without walls grains would fall for ever")
-        self.shear_rate = None if shear_rate is None else float(checks.finite("shear_rate", shear_rate))
-        if shear_gradient not in ("y", "z"):
-            raise ValueError(f"shear_gradient must be 'y' or 'z', got {shear_gradient!r}")
-        self.gradient = "xyz".index(shear_gradient)
-        if shear_rate is not None and (self.period is None or np.isinf(self.period[[0, self.gradient]]).any()):
-            raise ValueError(f"shear_rate needs periods along x and {shear_gradient}")
+        given = gravity, period, shear_rate, shear_gradient, stress, strain_rate, strain_start
+        self.cell = cell.of_scene(*given)
         self.gravity = checks.vector("gravity", gravity)
         self.large_bodies: list[LargeBody] = []
         #: Names of large bodies that go away from the grains: their speed asks for no stiffness.
@@ -179,14 +166,8 @@ class Scene:
         self.forms: list[Form] = []  #: the distinct shapes of clumps and polyhedra, see `dem.bodies`
         self.loads: dict[str, Load] = {}  #: by name
         self.springs: dict[str, Spring] = {}  #: by name
-        self.sources: dict[str, Source] = {}  #: by name
-        self.outlets: dict[str, Outlet] = {}  #: by name
+        self.passages = Passages()  #: sources and outlets
         self.joints: dict[str, Joint] = {}  #: by name
-
-    @property
-    def deforms(self) -> bool:
-        """Whether the periods of the cell change, by a stress or a strain rate."""
-        return self.stress is not None or self.strain_rate is not None
 
     def add_spheres(
         self,
@@ -420,7 +401,7 @@ class Scene:
         anchors, frames = [], []
         for position, turn in (self.pose(f"joint {name!r}", end) for end in (one, other)):
             back, arm = quaternion.conjugate(turn), place - position
-            arm = arm - whole_periods(arm, self.period)
+            arm = arm - self.cell.whole(arm)
             anchors.append(tuple(quaternion.rotate(back, arm).tolist()))
             frames.append(tuple(quaternion.multiply(back, upright).tolist()))
         for body in self.large_bodies:
@@ -449,28 +430,21 @@ class Scene:
     def add_source(self, name: str, region: Block | Cylinder, *, material: str = "default", **given: Any) -> None:
         """Let grains come in a region of `dem.measures`, where there is room; `given` are the fields of
         `dem.parts.sources.Source`: radius [m], density [kg/m^3], mass_rate [kg/s] or number_rate [1/s], and others."""
-        self._refuse_passage(name)
-        self.sources[name] = Source(region, material=self._material(material), **given)
+        self.passages.add(name, Source(region, material=self._material(material), **given))
 
     def add_outlet(self, name: str, region: Block | Cylinder, *, outside: bool = False) -> None:
         """Let grains leave whose centres are in a region of `dem.measures`; `outside`: those that are not in it."""
-        self._refuse_passage(name)
-        self.outlets[name] = Outlet(region, outside)
-
-    def _refuse_passage(self, name: str) -> None:
-        if not name or set(name) & set(',"\n') or name in {**self.sources, **self.outlets}:
-            raise ValueError(f"sources and outlets need distinct names without commas, got {name!r}")
+        self.passages.add(name, Outlet(region, outside))
 
     @property
     def first_large(self) -> int:
         """The id of the first large body: more than that of any grain that may come."""
-        return MOST_IDS if self.sources else self.count
+        return self.passages.first_large(self.count)
 
     @property
     def kinds(self) -> list[int]:
-        """The kinds of grains that there are, or that sources may add, as of `dem.bodies`."""
-        later = (source.extremes().shape.tolist() for source in self.sources.values())
-        return sorted({part.kind for part in self.parts}.union(*later))
+        """The kinds of grains that there are, or that may come, as of `dem.bodies`."""
+        return sorted({part.kind for part in self.parts} | {*self.passages.extremes().shape.tolist()})
 
     @property
     def count(self) -> int:
@@ -485,17 +459,14 @@ class Scene:
 
     def speeds(self, grains: Bodies) -> Floats:
         """Speeds (n,) of grains, in a sheared cell beside the flow [m/s]."""
-        x, y, z, *_ = grains.velocity.T
-        if self.shear_rate is not None:
-            x = x - self.shear_rate * grains.position[:, self.gradient]
+        x, y, z = self.cell.beside_flow(grains.position, grains.velocity[:, :3]).T
         return np.hypot(np.hypot(x, y), z)  # squares could overflow
 
     def expected(self) -> Bodies:
-        """Grains that stand for those of time zero, see `Survey`, and those of sources: of each the smallest and the
-        largest that may come. A scene without both has its large bodies that forces move, as spheres that fit into
-        their shapes. ValueError as of `grains`."""
+        """Grains that stand for those of time zero, see `Survey`, and for those that may come. A scene without both has
+        its large bodies that forces move, as spheres that fit into their shapes. ValueError as of `grains`."""
         self.grains(0, 0)
-        found = bodies.concatenate([self.survey().extremes, *(s.extremes() for s in self.sources.values())])
+        found = bodies.concatenate([self.survey().extremes, self.passages.extremes()])
         return found if len(found) else self._free()
 
     def _free(self) -> Bodies:
@@ -536,12 +507,12 @@ class Scene:
     def grains(self, first: int = 0, end: int | None = None) -> Bodies:
         """The grains from the id `first` on and before `end`, all by default. ValueError if there is nothing that
         moves."""
-        later = [source.extremes() for source in self.sources.values()]
+        later = self.passages.extremes()
         if self.count + len(later) + len(self._free()) == 0:
             raise ValueError("empty scene: there is no grain, and no large body that forces move")
-        if self.period is not None:
-            tables = [self.survey().extremes, *later]
-            _refuse_in_cell(self, self.period, max(float(bodies.bounding_radius(t).max(initial=0.0)) for t in tables))
+        if self.cell.periodic:
+            tables = self.survey().extremes, later
+            _refuse_in_cell(self, max(float(bodies.bounding_radius(t).max(initial=0.0)) for t in tables))
         return self._rows(first, self.count if end is None else end)
 
     def _rows(self, first: int, end: int) -> Bodies:
@@ -701,42 +672,32 @@ def least_half(body: LargeBody) -> float:
     return float(min(halves, default=np.inf))
 
 
-def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
-    """ValueError for what a scene with these periods (3,) [m] and grains of at most this radius [m] cannot have."""
-    axes = np.flatnonzero(np.isfinite(period))
+def _refuse_in_cell(scene: Scene, radius: float) -> None:
+    """ValueError for what a scene with periods and grains of at most this radius [m] cannot have."""
+    period, axes = scene.cell.period, np.flatnonzero(scene.cell.axes)
     for k in axes:
         if period[k] <= 4.0 * radius:
             raise ValueError(
                 f"period of {period[k]:g} m along {'xyz'[k]} is too short: a grain could meet another one on both its "
                 f"sides, or its own image; allowed is more than two greatest diameters, {4.0 * radius:g} m"
             )
-    if scene.shear_rate is not None or scene.deforms:
-        cell = "cell of given stress" if scene.deforms else "sheared cell"
+    if scene.cell.moves:
+        what = "cell of given stress" if scene.cell.deforms else "sheared cell"
         if scene.large_bodies:
-            raise ValueError(f"large body {scene.large_bodies[0].name!r}: a {cell} has grains alone")
-        if scene.sources or scene.outlets:
-            name = next(iter({**scene.sources, **scene.outlets}))
-            raise ValueError(f"{name!r}: a {cell} has no sources and outlets")
+            raise ValueError(f"large body {scene.large_bodies[0].name!r}: a {what} has grains alone")
+        if scene.passages:
+            raise ValueError(f"{scene.passages.names[0]!r}: a {what} has no sources and outlets")
         if scene.joints:
-            raise ValueError(f"joint {next(iter(scene.joints))!r}: a {cell} has no joints")
+            raise ValueError(f"joint {next(iter(scene.joints))!r}: a {what} has no joints")
     if scene.springs:
         raise ValueError(f"spring {next(iter(scene.springs))!r}: springs have no images, so periods allow none")
     for body in scene.large_bodies:
+        if wrong := scene.cell.why_refused(body.name, body.motion, body.shapes, body.quaternion):
+            raise ValueError(wrong)
         for shape in body.shapes:
-            kind, center, turn, size = shapes.placed(shape)
+            kind, center, _, size = shapes.placed(shape)
             if kind == PLANE:
-                normal = quaternion.rotate(body.quaternion, size)
-                across_them = [k for k in axes if abs(normal[k]) > 1e-9]
-                if across_them:
-                    raise ValueError(
-                        f"large body {body.name!r} has a plane across the periodic direction {'xyz'[across_them[0]]}; "
-                        "allowed are planes along it"
-                    )
                 continue
-            if not isinstance(body.motion, Fixed):
-                raise ValueError(
-                    f"large body {body.name!r} moves: with periods only bodies of planes may; other shapes are Fixed"
-                )
             middle = body.position + quaternion.rotate(body.quaternion, center)
             wide = float(bodies.enclosing_radius(np.array([kind]), size[None])[0])
             for k in axes:

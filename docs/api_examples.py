@@ -354,7 +354,7 @@ sim.run(until=1.0)
 shoulder = sim.joint("shoulder")
 print(f"angle {shoulder.angle:.3f} rad after 1 s at 0.5 rad/s, torque of the motor {shoulder.drive:.2f} N m")
 
-# %% dem.parts.sources.Source, dem.parts.sources.Outlet, dem.parts.sources.Tally
+# %% dem.parts.sources.Source, dem.parts.sources.Outlet, dem.parts.sources.Tally, dem.parts.sources.Passages
 import pctt
 from dem.measures import Block
 from dem.scene import Scene
@@ -366,6 +366,7 @@ scene.add_outlet("drain", below)
 sim = pctt.Simulation(scene, dt=0.005, solver="apgd")
 sim.run(until=1.0)
 print(sim.source("feed").count, "came,", sim.outlet("drain").count, "left,", len(sim.ids), "are there")
+print("counted are", ", ".join(sim.world.passages.names))
 
 # %% dem.parts.sources.Uniform, dem.parts.sources.Listed
 from dem.parts.sources import Listed, Uniform
@@ -437,7 +438,7 @@ from pctt.scenes import Mixer
 world = new_world(Mixer(n=1).build(), MPI.COMM_SELF)
 print(len(world.grains), "grains on this rank,", world.body_count, "bodies in all; time", world.time, "s")
 
-# %% dem.model.world.Shear
+# %% dem.parts.cell.Cell
 import pctt
 from dem.scene import Scene
 
@@ -446,15 +447,8 @@ scene = Scene(friction=0.5, **cell)
 scene.add_spheres([0.5, 0.5, 0.5], 0.1, 2500.0)
 sim = pctt.Simulation(scene, dt=0.01)
 sim.run(until=0.25)
-shear = sim.world.shear
-print("rate", shear.rate, "1/s: the images above are", round(shear.shift, 3), "m further along x")
-
-# %% dem.model.world.Servo
-import pctt
-from pctt.scenes import PlaneShear
-
-sim = pctt.Simulation(PlaneShear(n=6))
-print("stress that the cell is to have along x, y, z:", sim.world.servo.asked, "Pa")
+cell = sim.world.cell
+print("rate", cell.shear_rate, "1/s: the images above are", round(cell.shift, 3), "m further along x")
 
 # %% dem.bodies.Bodies
 import pctt

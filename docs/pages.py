@@ -33,8 +33,8 @@ PARTS = {
     "Simulations and their results": ["pctt", "pctt.simulation", "pctt.folder", "pctt.analysis", "dem.measures"],
     "What a scene is made of": [
         "dem.scene", "dem.shapes", "dem.mesh", "dem.motion", "dem.parts.contact_law", "dem.parts.loads",
-        "dem.parts.springs", "dem.parts.joints", "dem.parts.sources", "dem.packing", "dem.experiment", "pctt.scenes",
-        "dem.start.stiffness", "dem.start.time_step", "dem.checks", "dem.record.analysis",
+        "dem.parts.springs", "dem.parts.joints", "dem.parts.sources", "dem.parts.cell", "dem.packing", "dem.experiment",
+        "pctt.scenes", "dem.start.stiffness", "dem.start.time_step", "dem.checks", "dem.record.analysis",
     ],
     "What a time step is made of": [
         "dem.start", "dem.model.world", "dem.bodies", "dem.unconstrained", "dem.contact", "dem.step.system",
@@ -55,6 +55,7 @@ ONLY = {
     "dem.parts.loads": ["Load"],
     "dem.parts.springs": ["Spring"],
     "dem.parts.joints": ["Joint"],
+    "dem.parts.cell": ["Cell"],
 }
 
 

@@ -16,7 +16,7 @@ import dataclasses
 import html
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ from dem.experiment import Experiment, Given
 from dem.measures import Sample
 from dem.mesh import Mesh
 from dem.model.changes import change, refuse_functions
-from dem.model.period import velocity_in_cell, wrapped
 from dem.motion import Motion
 from dem.parts.loads import Load
 from dem.parts.sources import Tally
@@ -249,23 +248,18 @@ class Simulation:
     def source(self, name: str) -> Tally:
         """What has come from a source: ``count``, ``mass`` [kg], and ``refused``, the steps in which it had no room.
         ValueError if there is none of that name. Not collective."""
-        return self._passage("source", self.world.sources, name)
+        return self.world.passages.passed("source", name)
 
     def outlet(self, name: str) -> Tally:
         """What has left by an outlet: ``count`` and ``mass`` [kg]. ValueError if there is none of that name. Not
         collective."""
-        return self._passage("outlet", self.world.outlets, name)
-
-    def _passage(self, what: str, there: Mapping[str, Any], name: str) -> Tally:
-        if name not in there:
-            raise ValueError(f"no {what} {name!r}; there are: {', '.join(there) or 'none'}")
-        return dataclasses.replace(self.world.tallies[name])
+        return self.world.passages.passed("outlet", name)
 
     @property
     def positions(self) -> Floats:
         """Centres (n, 3) of all grains on every rank, in the order in which the scene added them, within the cell of a
         periodic scene [m]."""
-        return wrapped(self._of_grains("position"), self.world.period, self.world.shear)
+        return self._of_grains("position")
 
     @property
     def orientations(self) -> Floats:
@@ -275,9 +269,7 @@ class Simulation:
     @property
     def velocities(self) -> Floats:
         """Linear and angular velocities (n, 6) of all grains on every rank, in the order of the scene [m/s, rad/s]."""
-        if self.world.shear is None:
-            return self._of_grains("velocity")
-        return velocity_in_cell(self._of_grains("position"), self._of_grains("velocity"), self.world.shear)
+        return self._of_grains("velocity")
 
     @property
     def local(self) -> Bodies:
@@ -286,7 +278,7 @@ class Simulation:
         return self.world.grains
 
     def _of_grains(self, name: str) -> np.ndarray:
-        grains = self.world.grains
+        grains = self.world.cell.inside(self.world.grains)
         found = self._gathered(name, id=grains.id, values=getattr(grains, name))
         return found["values"][np.argsort(found["id"])]
 
@@ -361,7 +353,8 @@ class Simulation:
     def period(self) -> Floats | None:
         """The lengths (3,) of the periodic cell now [m], inf: none along that axis; None: no axis has one. Not
         collective."""
-        return None if self.world.period is None else self.world.period.copy()
+        cell = self.world.cell
+        return cell.period.copy() if cell.periodic else None
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -483,8 +476,6 @@ class Simulation:
         table = {name: np.concatenate([self._of_grains(name), getattr(large, name)]) for name in names}
         position, turn, velocity = (table.pop(name) for name in names[:3])
         grains = len(position) - len(large)
-        velocity[:grains] = velocity_in_cell(position[:grains], velocity[:grains], world.shear)
-        position[:grains] = wrapped(position[:grains], world.period, world.shear)
         contacts = self.contacts if self.last else Contacts.none()
         what = Table(**table, grains=grains, forms=described_forms(world))
         frame = Frame(self.steps, self.time, position, turn, velocity, contacts, what)

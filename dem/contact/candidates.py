@@ -33,7 +33,7 @@ def meeting(
             found.append(_of_large(world, near, table, delta, shifts))
     else:
         found.append(_of_grains(near, lists.away, foreign, table, delta, shifts, grown))
-    if lists.images is not None:
+    if len(lists.images):
         if last:
             found.append(_of_grains(near, lists.away, np.zeros_like(foreign), table, delta, shifts, grown))
         found.append(_of_images(near, lists.images.own(near.grains) & grown[near.grains :], table, delta, shifts))

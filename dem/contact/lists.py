@@ -19,9 +19,10 @@ from dem.contact.broad import close_pairs
 from dem.contact.primitives import Primitives, primitives
 from dem.contact_map import Halo
 from dem.exchange import on_any
+from dem.model.images import Images, images
 from dem.model.neighbourhood import Neighbourhood, neighbourhood
-from dem.model.period import Images, between, images
 from dem.model.world import World
+from dem.parts.cell import Cell
 
 #: The slack of a grain at rest, as a part of its radius. In a mixer lists of 0.2 and 8 have a fifth more pairs than
 #: those of 0.1 and 4, and are made half as often: a search takes 5 % less.
@@ -49,19 +50,13 @@ class Lists:
     margin: Floats  #: (grains,) without slack [m]
     own: Rows  #: pairs of local grains
     away: Rows  #: pairs of a local grain and a ghost or an image
-    images: Images | None  #: of grains and ghosts, in a periodic world
-    shift: float  #: of a sheared cell, then [m]
-    period: Floats | None  #: (3,) then [m]
+    images: Images  #: of grains and ghosts
+    cell: Cell  #: then
     constant: list[Any]  #: the columns of the world's tables, and the shapes, that no step changes
 
     def hold(self, world: World, margin: Floats) -> bool:
         """Whether the lists of this rank have all pairs of these margins (grains,)."""
-        if world.shear is not None:
-            margin = margin + 0.5 * abs(world.shear.shift - self.shift)  # both share the way of an image
-        if world.servo is not None and world.period is not None and self.period is not None:
-            growth = np.abs(world.period - self.period)
-            most = 2.0 + abs(self.shift) / self.period[0]  # periods along x in the ways of images of a sheared cell
-            margin = margin + 0.5 * growth @ (most, 1.0, 1.0)
+        margin = margin + world.cell.gone_since(self.cell)
         same = all(then is now for then, now in zip(self.constant, _constant(world)))
         return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
 
@@ -77,23 +72,17 @@ def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
     size = bodies.bounding_radius(world.grains)
     near = neighbourhood(world, margin + np.minimum(AT_REST * size + STEPS * way, size))
     grains, count = near.grains, near.grains + near.ghosts
-    periodic = None if world.period is None else images(world, near)
-    wide = near if periodic is None else periodic.among(near)
+    pictures = images(world, near)
+    wide = pictures.among(near)
     seen = wide.grains + wide.ghosts
     large = [body.shapes for body in world.large_bodies]
     table = primitives(wide, large, world.first_large, world.forms, world.initial)
-    pairs = close_pairs(table.center[:seen], table.radius[:seen] + wide.margin)
-    if periodic is not None:
-        pairs = between(pairs, wide)
+    pairs = pictures.once(close_pairs(table.center[:seen], table.radius[:seen] + wide.margin), wide.index)
     index = near.index[grains:count]
     owner = np.searchsorted(world.slabs, index, side="right") - 1
     halo = Halo(world.comm, grains, len(near.bodies), np.arange(grains, count), owner, index - world.slabs[owner])
     own, away = (Rows(*in_rows(pairs, table.number, grains, *ends)) for ends in ((0, grains), (grains, seen)))
-    return Lists(near, halo, table, margin, own, away, periodic, _shift(world), world.period, _constant(world))
-
-
-def _shift(world: World) -> float:
-    return 0.0 if world.shear is None else world.shear.shift
+    return Lists(near, halo, table, margin, own, away, pictures, world.cell, _constant(world))
 
 
 def _constant(world: World) -> list[Any]:

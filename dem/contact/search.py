@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -12,12 +13,13 @@ from dem.bodies import CAPSULE, FORM, MESH, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.ahead import Course
-from dem.contact.candidates import meeting
+from dem.contact.candidates import Pairs, meeting
 from dem.contact.lists import Lists, grain_lists
-from dem.contact.primitives import extents, touches, touches_ahead
+from dem.contact.primitives import Manifold, Primitives, extents, touches, touches_ahead
+from dem.model.images import Images, refuse_short
 from dem.model.neighbourhood import Neighbourhood, refreshed
-from dem.model.period import Images, refuse_short
 from dem.model.world import World
+from dem.parts.cell import Cell
 from dem.quaternion import cross, length
 from dem.unconstrained import UnconstrainedMotion
 from dem.unconstrained.drives import free_directions, free_turns
@@ -81,12 +83,12 @@ class Contacts:
         way = position[self.b] - position[self.a]
         return way if self.moved is None else way + self.moved
 
-    def flow(self, world: World, position: Floats) -> Floats | None:
+    def flow(self, cell: Cell, position: Floats) -> Floats | None:
         """What the cell adds to the velocities of b relative to a (nc, 3) in a step from these positions (rows, 3), by
-        its shear and by the rates of its periods; None: nothing [m/s]."""
-        if world.servo is None:
+        its shear and as it changes its size; None: nothing [m/s]."""
+        if not cell.deforms:
             return self.drift
-        affine: Floats = world.servo.rate * self.way(position)
+        affine: Floats = cell.rate * self.way(position)
         return affine if self.drift is None else self.drift + affine
 
     def take(self, rows: np.ndarray) -> Contacts:
@@ -109,23 +111,44 @@ def find_contacts(
     contacts that a search with margins not greater has found, only those are found that are not among them.
     """
     not_negative("contact distance delta", delta)
+    margin, way, shifts = _margins(world, delta, free, margin, shifts)
+    refuse_short(world, margin)
+    lists = grain_lists(world, world.lists if lists is None else lists, margin, way)
+    base, images = refreshed(lists.near, lists.halo, world, margin), lists.images.now(world.cell)
+    near, grown = images.among(base), _grown(base, shifts, besides)[images.rows]
+    table = lists.table.now(near)
+    pairs = _that_touch(world, near, table, meeting(world, near, lists, table, delta, shifts, grown))
+    table, i, j, reach = table.of_members(*pairs)
+    found, ahead = _narrow(world, near, images, table, (i, j, reach), free)
+    key, a, b, body, friction, owned = named(
+        *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
+        *(table.hulls.features, near.grains, i, j, found.pair, found.feature),
+    )
+    contacts = Contacts(key, a, b, body, *found.touch, friction, near, shifts, owned, lists, **ahead)
+    if world.cell.periodic:
+        contacts = _without_images(world, contacts, base, images)
+    _put_in_order(world, contacts, found.pair, table.members is not None or world.cell.periodic)
+    if besides is not None:
+        contacts = contacts.take(places(besides.key, contacts.key) < 0)
+    return _without_rigid(world, contacts)
+
+
+def _margins(
+    world: World, delta: float, free: UnconstrainedMotion | None, least: Floats | float, shifts: Floats | None
+) -> tuple[Floats, Floats, Floats]:
+    """The margins (grains,) of a search, of at least the `least`, the ways (grains,) of the grains in the step [m], and
+    the shifts (k, large, 6) of the large bodies, by default those of the motion without contacts."""
     dt, velocity = (0.0, world.grains.velocity) if free is None else (free.dt, free.grains)
     if shifts is None:
         shifts = (np.zeros_like(world.large.velocity) if free is None else dt * free.drives.free)[None]
     way = ways(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
-    way = way + cell_way(world, dt)
-    margin = np.maximum(np.maximum(delta / 2, way), margin)
-    refuse_short(world, margin)
-    lists = grain_lists(world, world.lists if lists is None else lists, margin, way)
-    base = near = refreshed(lists.near, lists.halo, world, margin)
-    grown = _grown(base, shifts, besides)
-    pictures = lists.images
-    if pictures is not None:
-        if world.shear is not None or world.servo is not None:
-            pictures = pictures.now(world)
-        near, grown = pictures.among(base), grown[pictures.rows]
-    table = lists.table.now(near)
-    i, j, reach = meeting(world, near, lists, table, delta, shifts, grown)
+    way = way + world.cell.margin(dt, world.grains)
+    return np.maximum(np.maximum(delta / 2, way), least), way, shifts
+
+
+def _that_touch(world: World, near: Neighbourhood, table: Primitives, pairs: Pairs) -> Pairs:
+    """The pairs of materials that touch each other, and of bodies that are not `World.apart`."""
+    i, j, reach = pairs
     if not world.pairs.touching.all():
         material = near.bodies.material[table.row]
         touch = world.pairs.touching[material[i], material[j]] > 0.0
@@ -134,50 +157,41 @@ def find_contacts(
         one, other = near.bodies.id[table.row[i]], near.bodies.id[table.row[j]]
         touch = ~np.isin(np.minimum(one, other) + 1j * np.maximum(one, other), world.apart)
         i, j, reach = i[touch], j[touch], reach[touch]
-    table, i, j, reach = table.of_members(i, j, reach)
-    moved: Floats | None = None
-    swing: Floats | None = None
-    linear: Floats | None = None
-    if free is not None:
-        motions = _motions(world, near, pictures, free.prescribed)
-        course = Course(near.bodies.position, motions, bodies.is_dynamic(near.bodies), free.dt)
-        (pair, feature, touch), moved, swing, linear = touches_ahead(table, i, j, reach, course)
-    else:
-        pair, feature, touch = touches(table, i, j, reach)
-    key, a, b, body, friction, owned = named(
-        *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
-        *(table.hulls.features, near.grains, i, j, pair, feature),
-    )
-    contacts = Contacts(key, a, b, body, *touch, friction, near, shifts, owned, lists, moved, linear, swing)
-    if pictures is not None:
-        contacts = _without_images(world, contacts, base, pictures)
-    back = np.flatnonzero(pair[1:] <= pair[:-1])  # other shapes come behind the spheres, and touch in several points
-    of_clumps = table.members is not None
-    if (len(back) or of_clumps) and lists.images is None:
-        first = 0 if of_clumps else int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min()))
+    return i, j, reach
+
+
+def _narrow(
+    world: World, near: Neighbourhood, images: Images, table: Primitives, pairs: Pairs, free: UnconstrainedMotion | None
+) -> tuple[Manifold, dict[str, Any]]:
+    """The contacts of pairs, and with a motion the columns of `Contacts` that look ahead to the end of the step."""
+    if free is None:
+        return touches(table, *pairs), {}
+    motions = _motions(world, near, images, free.prescribed)
+    course = Course(near.bodies.position, motions, bodies.is_dynamic(near.bodies), free.dt)
+    found, moved, swing, linear = touches_ahead(table, *pairs, course)
+    return found, {"moved": moved, "swing": swing, "linear": linear}
+
+
+def _put_in_order(world: World, contacts: Contacts, pair: Ints, whole: bool) -> None:
+    """Order the rows of the contacts of these pairs (nc,), unless the `whole` needs it only those from the first one on
+    that has others behind it: shapes beside spheres come behind these, and touch in several points."""
+    back = np.flatnonzero(pair[1:] <= pair[:-1])
+    if whole or len(back):
+        first = 0 if whole else int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min()))
         left = slice(first, None)
-        order = contact_order(world, near, a[left], b[left], key[left])
+        order = contact_order(world, contacts.near, contacts.a[left], contacts.b[left], contacts.key[left])
         for column in contacts.columns().values():
             column[left] = column[left].take(order, axis=0)
-    if besides is not None:
-        contacts = contacts.take(places(besides.key, contacts.key) < 0)
-    if not bodies.is_dynamic(world.large).any():
-        return contacts
-    rigid = _gives_no_way(world, contacts)
-    if not rigid.any():
-        return contacts
-    return replace(contacts.take(~rigid), held_overlap=-float(contacts.gap[rigid].min(initial=0.0)))
 
 
-def _motions(world: World, near: Neighbourhood, pictures: Images | None, prescribed: Floats) -> Floats:
+def _motions(world: World, near: Neighbourhood, images: Images, prescribed: Floats) -> Floats:
     """Velocities (rows, 6) before the step of the bodies of a neighbourhood, of prescribed ones those of the step;
     images and centres have those that a cell gives them."""
     velocity, seen = near.bodies.velocity.copy(), near.grains + near.ghosts
     velocity[seen:] = prescribed
-    if world.shear is not None and pictures is not None:
-        velocity[:seen, 0] += world.shear.speed * pictures.boundaries(np.arange(seen))
-    if world.servo is not None:
-        velocity[:seen, :3] += world.servo.rate * near.bodies.position[:seen]
+    if world.cell.moves:
+        velocity[:seen, 0] += world.cell.speed * images.boundaries(np.arange(seen))
+        velocity[:seen, :3] += world.cell.rate * near.bodies.position[:seen]
     return velocity
 
 
@@ -192,30 +206,18 @@ def velocities_about(contacts: Contacts, velocity: Floats, large: Floats) -> Flo
     return table
 
 
-def cell_way(world: World, dt: float) -> Floats | float:
-    """What margins (grains,) have beside the ways of the grains in dt [s]: half the way of images behind a sheared
-    boundary, as both grains of a pair have a half, and the share of a grain in the way by which a cell that changes its
-    size brings the centres of a pair together [m]."""
-    way: Floats | float = 0.0 if world.shear is None else 0.5 * dt * abs(world.shear.speed)
-    if world.servo is not None and world.servo.rate.any():
-        reach = 3.0 * bodies.bounding_radius(world.grains)  # with a margin of two radii, the greatest of `ways`
-        way = way + dt * np.abs(world.servo.rate).max() * reach
-    return way
-
-
 def _without_images(world: World, contacts: Contacts, near: Neighbourhood, images: Images) -> Contacts:
-    """The contacts of a table with images as contacts of the bodies of `near`, at the place of body a and in order."""
+    """The contacts of a table with images as contacts of the bodies of `near`, at the place of body a."""
     (a, way), (b, moved) = images.place(contacts.a), images.place(contacts.b)
     moved = moved - way
     if contacts.moved is not None:
         moved += contacts.moved
     found = replace(contacts, a=a, b=b, near=near, point=contacts.point - way, moved=moved)
-    if world.shear is not None:
+    if world.cell.moves:
         boundaries = images.boundaries(contacts.b) - images.boundaries(contacts.a)
-        found = replace(found, drift=np.outer(world.shear.speed * boundaries, (1.0, 0.0, 0.0)))
+        found = replace(found, drift=np.outer(world.cell.speed * boundaries, (1.0, 0.0, 0.0)))
     owner = np.minimum(a, b)
-    owned = np.bincount(owner[owner < near.grains], minlength=near.grains).astype(float)
-    return replace(found.take(contact_order(world, near, a, b, contacts.key)), owned=owned)
+    return replace(found, owned=np.bincount(owner[owner < near.grains], minlength=near.grains).astype(float))
 
 
 def _grown(near: Neighbourhood, shifts: Floats, besides: Contacts | None) -> Bools:
@@ -300,25 +302,26 @@ def ways(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
     return out
 
 
-def _gives_no_way(world: World, contacts: Contacts) -> Bools:
-    """Which contacts (nc,) no force can open: those whose normal is across the free directions of a body and that do
-    not turn it about a free axis, if the other body is held too.
+def _without_rigid(world: World, contacts: Contacts) -> Contacts:
+    """The contacts without those that no force can open, and how deep these overlap.
 
-    Their normal impulse changes no velocity, and would allow any friction.
-    """
-    near = contacts.near
+    Their normals are across the free directions of a body, and they do not turn it about a free axis, and the other
+    body is held too. Their normal impulse changes no velocity, and would allow any friction."""
+    near, moves = contacts.near, bodies.is_dynamic(world.large)[:, None, None]
     first = near.grains + near.ghosts
     rigid = np.minimum(contacts.a, contacts.b) >= first
-    if rigid.any():
-        these = contacts.take(rigid)
-        moves = bodies.is_dynamic(world.large)[:, None, None]
-        free, turns = free_directions(world.large_bodies) * moves, free_turns(world.large_bodies) * moves
-        normal, opens = these.normal, np.zeros(len(these))
-        moved = 0.0 if these.moved is None else these.moved
-        for body, way in ((these.a, 0.0), (these.b, moved)):
-            arm = these.point - near.bodies.position[body] - way
-            lever = cross(arm / np.maximum(length(arm), 1e-300)[:, None], normal)
-            opens += np.einsum("ci,cij,cj->c", normal, free[body - first], normal)
-            opens += np.einsum("ci,cij,cj->c", lever, turns[body - first], lever)
-        rigid[rigid] = opens <= 1e-8
-    return rigid
+    if not (moves.any() and rigid.any()):
+        return contacts
+    these = contacts.take(rigid)
+    free, turns = free_directions(world.large_bodies) * moves, free_turns(world.large_bodies) * moves
+    normal, opens = these.normal, np.zeros(len(these))
+    moved = 0.0 if these.moved is None else these.moved
+    for body, way in ((these.a, 0.0), (these.b, moved)):
+        arm = these.point - near.bodies.position[body] - way
+        lever = cross(arm / np.maximum(length(arm), 1e-300)[:, None], normal)
+        opens += np.einsum("ci,cij,cj->c", normal, free[body - first], normal)
+        opens += np.einsum("ci,cij,cj->c", lever, turns[body - first], lever)
+    rigid[rigid] = opens <= 1e-8
+    if not rigid.any():
+        return contacts
+    return replace(contacts.take(~rigid), held_overlap=-float(contacts.gap[rigid].min(initial=0.0)))

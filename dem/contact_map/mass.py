@@ -165,7 +165,7 @@ class JointedMass(InverseMass):
         return BlockRows(found.indptr.astype(np.int64), bodies[found.indices], found.data, known.columns)
 
 
-class Cell(NamedTuple):
+class CellStep(NamedTuple):
     """What a step knows of its cell."""
 
     lever: Floats  #: (nc, 9) the frames of the contacts, with columns times the ways from centre to centre [m]
@@ -185,7 +185,7 @@ class CellMass(InverseMass):
 
     couples, shared = True, 1
 
-    def __init__(self, comm: MPI.Comm, root: Floats, cell: Cell, precision: type[np.floating] = np.float64):
+    def __init__(self, comm: MPI.Comm, root: Floats, cell: CellStep, precision: type[np.floating] = np.float64):
         super().__init__(root, precision)
         self.comm, self.cell = comm, cell
         self.more = int(comm.rank == comm.size - 1)

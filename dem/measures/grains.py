@@ -8,7 +8,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
-from dem.measures.images import images
+from dem.measures.images import about, images
 from dem.measures.sample import Sample, summed
 from dem.mesh import Mesh, Surface
 
@@ -84,9 +84,7 @@ def triangle_forces(sample: Sample, body: int, mesh: Mesh, position: Floats, tur
     force = sample.force * (second.astype(float) - first)[:, None]
     rows = first | second
     back, own = quaternion.conjugate(turn), np.array(mesh.quaternion)
-    periods = [np.arange(-1.0, 2.0) if way.any() else np.zeros(1) for way in sample.lattice]  # a mesh is no longer
-    steps = np.stack(np.meshgrid(*periods, indexing="ij"), axis=-1).reshape(-1, 3)
-    point = sample.point[rows, None] + steps @ sample.lattice
+    point = sample.point[rows, None] + about(sample.lattice)  # a mesh is no longer than the cell
     point = quaternion.rotate(back, point - position) - np.array(mesh.center)
     point = quaternion.rotate(quaternion.conjugate(own), point) - mesh.surface.middle
     out = np.zeros((len(mesh.surface.triangle), 3))

@@ -41,6 +41,13 @@ def images(
     return np.concatenate(rows), np.concatenate(steps)
 
 
+def about(lattice: Floats) -> Floats:
+    """The ways (k, 3) to the next images of a lattice (3, 3) on all sides, and to the point itself [m]."""
+    steps = [np.arange(-1.0, 2.0) if way.any() else np.zeros(1) for way in lattice]
+    ways: Floats = np.array(list(product(*steps))) @ lattice
+    return ways
+
+
 def nearest_image(vector: Floats, lattice: Floats) -> Floats:
     """Vectors (n, 3) [m] less the repetitions of the lattice (3, 3) that are nearest to them along each axis."""
     out = vector.copy()

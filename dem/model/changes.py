@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from dem.parts.named import Named
 from dem.scene import LargeBody, checked_surface
 
 #: The fields of a `World` that have parts by their names, by what a part is called.
-PARTS = {"load": "loads", "spring": "springs", "joint": "joints", "source": "sources"}
+PARTS = {"load": "loads", "spring": "springs", "joint": "joints", "source": "passages.sources"}
 KINDS = (*PARTS, "body", "cell")
 
 
@@ -39,7 +40,8 @@ def change(world: World, what: str, **values: Any) -> None:
         raise ValueError(f"{what!r}: allowed are {', '.join(KINDS[:-1])} with a name, and cell" + nearest(kind, KINDS))
     refuse_functions(what, values)
     if kind == "cell":
-        _change_cell(world, **values)
+        _refuse_others(what, values, world.cell.CHANGED)
+        world.cell = world.cell.changed(world.time, **values)
     elif kind == "body":
         _change_body(world, name, **values)
     else:
@@ -54,7 +56,7 @@ def refuse_functions(what: str, values: Mapping[str, Any]) -> None:
 
 
 def _change_part(world: World, kind: str, name: str, **values: Any) -> None:
-    there: dict[str, Named] = getattr(world, PARTS[kind])
+    there: dict[str, Named] = attrgetter(PARTS[kind])(world)
     part = there.get(name)
     if part is None and kind == "load" and "on" in values:
         part = Load(values["on"])
@@ -62,13 +64,13 @@ def _change_part(world: World, kind: str, name: str, **values: Any) -> None:
         begins = "; give on=... to begin one" * (kind == "load")
         raise ValueError(f"no {kind} {name!r}; there are: {', '.join(there) or 'none'}{nearest(name, there)}{begins}")
     _refuse_others(f"{kind} {name!r}", values, part.CHANGED)
-    _put(world, kind, name, part.changed(world.time, world.tallies.get(name), **values))
+    _put(world, kind, name, part.changed(world.time, world.passages.tallies.get(name), **values))
 
 
 def _put(world: World, kind: str, name: str, part: Named) -> None:
     if isinstance(part, Load):
         refuse_load(world, name, part)
-    getattr(world, PARTS[kind])[name] = part
+    attrgetter(PARTS[kind])(world)[name] = part
     world.changed.add((kind, name))
 
 
@@ -138,28 +140,6 @@ def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: 
     return start
 
 
-# -- the cell ------------------------------------------------------------------------------------------------
-
-
-def _change_cell(world: World, **values: Any) -> None:
-    """Shear the cell at another rate [1/s], ask for other stresses (3,) [Pa], or compress it at other rates (3,) [1/s],
-    in the place of stresses, from now on; None: none along an axis. ValueError if the scene has none of its kind."""
-    _refuse_others("cell", values, ("shear_rate", "stress", "strain_rate"))
-    shear, servo = world.shear, world.servo
-    if "shear_rate" in values:
-        if shear is None:
-            raise ValueError("shear_rate: the cell of this scene is not sheared; give the Scene a shear_rate, or 0")
-        shear = dataclasses.replace(shear, rate=float(checks.finite("shear_rate", values["shear_rate"])))
-    for name in ("stress", "strain_rate"):
-        if name in values and servo is None:
-            raise ValueError(f"{name}: the periods of this cell are constant; give the Scene a stress or a strain_rate")
-    if servo is not None and "stress" in values:
-        servo = dataclasses.replace(servo, asked=checks.stress(values["stress"]))
-    if servo is not None and "strain_rate" in values:
-        servo = dataclasses.replace(servo, strain=checks.strain_rate(values["strain_rate"]), start=world.time)
-    world.shear, world.servo = shear, servo
-
-
 # -- checkpoints ---------------------------------------------------------------------------------------------
 
 
@@ -170,7 +150,7 @@ def changes(world: World) -> str:
         if kind == "body":
             entry = _entry(world.large_bodies[world.large_row(name)])
         else:
-            part = getattr(world, PARTS[kind])[name]
+            part = attrgetter(PARTS[kind])(world)[name]
             entry = {key: getattr(part, key) for key in part.KEPT}
         found.setdefault(kind, {})[name] = {key: value for key, value in entry.items() if not callable(value)}
     return json.dumps(found, default=lambda array: array.tolist())
@@ -183,7 +163,7 @@ def restore(world: World, text: str) -> None:
             if kind == "body":
                 world.replace_large(_restored(world.large_bodies[world.large_row(name)], entry))
                 continue
-            there = getattr(world, PARTS[kind])
+            there = attrgetter(PARTS[kind])(world)
             if name not in there and kind != "load":
                 raise ValueError(f"the scene has no {kind} {name!r}")
             part = there.get(name) or Load(None)

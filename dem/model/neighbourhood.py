@@ -6,7 +6,6 @@ A contact belongs to the rank of the lower global body index: ghosts only travel
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.contact_map.halo import Halo
 from dem.exchange import exchange
-from dem.model.world import Shear, World
+from dem.model.world import World
 
 
 @dataclass(frozen=True)
@@ -48,12 +47,9 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
         )
     mine, large = world.slabs[comm.rank] + np.arange(len(grains)), world.slabs[-1] + np.arange(len(world.large))
     columns = dict(grains.columns(), margin=margin, index=mine)
-    row, rank = touched(grains.position, radius, boxes[: comm.rank])
-    if world.period is not None:
-        ways, _ = image_ways(world.period, world.shear)
-        more = [touched(grains.position + way, radius, boxes[: comm.rank]) for way in ways]
-        both = np.concatenate([np.stack([rank, row]), *(np.stack(pair[::-1]) for pair in more)], axis=1)
-        rank, row = np.unique(both, axis=1)
+    seen = [touched(grains.position + way, radius, boxes[: comm.rank]) for way in world.cell.ways]
+    row, rank = np.concatenate(seen, axis=1)
+    rank, row = np.divmod(np.unique(rank * len(grains) + row), max(len(grains), 1))
     ghosts = exchange(comm, {name: column[row] for name, column in columns.items()}, rank)
     index, ghost_margin = ghosts.pop("index"), ghosts.pop("margin")
     return Neighbourhood(
@@ -81,21 +77,6 @@ def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> 
         for name, part in (("position", slice(3)), ("quaternion", slice(3, 7)), ("velocity", slice(7, 13)))
     }
     return replace(near, bodies=replace(near.bodies, **columns), margin=np.concatenate([margin, ghosts[:, 13]]))
-
-
-def image_ways(period: Floats, shear: Shear | None = None) -> tuple[Floats, Floats]:
-    """By what (k, 3) images are moved, for the periods (3,) [m], inf: none; and how many sheared boundaries (k,) lie
-    between them and the cell. Behind one, images are shifted by up to half a period, so that one more may be near."""
-    each: list[tuple[float, ...]] = [(-1.0, 0.0, 1.0) if np.isfinite(length) else (0.0,) for length in period]
-    if shear is not None:
-        each[0] = (-2.0, -1.0, 0.0, 1.0, 2.0)
-    whole = np.array([steps for steps in product(*each) if any(steps)])
-    across = np.zeros(len(whole)) if shear is None else whole[:, shear.axis]
-    near = (np.abs(whole[:, 0]) < 2.0) | (across != 0.0)
-    ways = whole[near] * np.where(np.isfinite(period), period, 0.0)
-    if shear is not None:
-        ways[:, 0] += across[near] * (shear.shift - period[0] * np.round(shear.shift / period[0]))
-    return ways, across[near]
 
 
 def chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:

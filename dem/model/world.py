@@ -14,55 +14,19 @@ from dem import bodies
 from dem.arrays import Floats, Ints, Keys
 from dem.bodies import Bodies
 from dem.motion import Dynamic, Pose, checked_pose
+from dem.parts.cell import OPEN, Cell
 from dem.parts.contact_law import ContactLaw
 from dem.parts.joints import Joint
 from dem.parts.loads import Load
-from dem.parts.sources import Outlet, Source, Tally, as_array
+from dem.parts.sources import Passages
 from dem.parts.springs import Spring
 from dem.scene import LargeBody
 from dem.shapes.forms import Form
 from dem.together import together
 
-
-@dataclass(frozen=True)
-class Shear:
-    """A simple shear of a periodic cell (Lees and Edwards 1972): flow along x, with its gradient along y or z."""
-
-    rate: float  #: d v_x / d y or z [1/s]
-    axis: int  #: of the gradient: 1 or 2
-    length: float  #: the period along it [m]
-    shift: float = 0.0  #: by how much the images behind that period are moved along x so far [m]
-
-    @property
-    def speed(self) -> float:
-        """Velocity along x of the images behind the period, relative to their grains [m/s]."""
-        return self.rate * self.length
-
-    def after(self, dt: float) -> Shear:
-        """dt [s] later."""
-        return dataclasses.replace(self, shift=self.shift + dt * self.speed)
-
-
-@dataclass(frozen=True)
-class Servo:
-    """The stresses or strain rates that a periodic cell is to have: its periods change, and all centres with them; see
-    `dem.step.servo`."""
-
-    asked: Floats  #: (3,) stresses along x, y, z, positive in compression; NaN: none [Pa]
-    strain: Floats  #: (3,) strain rates in the place of the stresses from `start` on, likewise [1/s]
-    start: float = 0.0  #: [s]
-    rate: Floats = field(default_factory=lambda: np.zeros(3))  #: (3,) of the periods in the last step, over them [1/s]
-
-    def given_at(self, time: float, dt: float) -> Floats:
-        """Rates (3,) at which the periods are to grow in the step of dt [s] from the `time` [s]; NaN: what the asked
-        stress needs, or none [1/s]."""
-        return -self.strain if time >= self.start - 1e-6 * dt else np.full(3, np.nan)
-
-
 #: The fields of a world that a step changes; what these refer to is replaced, and never changed in place.
 STATE = (
-    "grains", "large", "slabs", "only_spheres", "lists", "expected", "period", "shear", "servo", "tallies", "time",
-    "step", "spare",
+    "grains", "large", "slabs", "only_spheres", "lists", "expected", "cell", "passages", "time", "step", "spare",
 )  # fmt: skip
 
 
@@ -87,15 +51,11 @@ class World:
     joints: dict[str, Joint] = field(default_factory=dict)  #: by name
     #: pairs of ids, the lower + 1j the upper, of bodies that joints join and that do not touch each other
     apart: Keys = field(default_factory=lambda: np.zeros(0, complex))
-    period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
-    sources: dict[str, Source] = field(default_factory=dict)  #: by name
-    outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
-    tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets, by name
+    cell: Cell = OPEN
+    passages: Passages = field(default_factory=Passages)  #: where grains come and go
     forms: tuple[Form, ...] = ()  #: shapes of grains, by their numbers
     initial: int = 0  #: number of grains at time zero
     first_large: int = 0  #: id of the first large body
-    shear: Shear | None = None  #: of the cell
-    servo: Servo | None = None  #: of the size of the cell
     time: float = 0.0  #: [s]
     step: int = 0  #: number of steps done
     spare: float = 3000.0  #: iterations that steps at rest may spend beyond the limits of the solver, `pctt.run.rest`
@@ -117,7 +77,6 @@ class World:
         """A world that a step may change: this one stays as it is until it takes its state."""
         other = copy(self)
         other.grains, other.large = dataclasses.replace(self.grains), dataclasses.replace(self.large)
-        other.tallies = {name: dataclasses.replace(tally) for name, tally in self.tallies.items()}
         return other
 
     def take(self, trial: World) -> None:
@@ -133,14 +92,7 @@ class World:
         if self.expected is not None:
             replicated["expected"] = self.expected
         replicated["spare"] = np.array(self.spare)
-        if self.tallies:
-            replicated["tallies"] = as_array(self.tallies)
-        if self.shear is not None:
-            replicated["shear"] = np.array([self.shear.rate, self.shear.shift])
-        if self.servo is not None:
-            servo = self.servo
-            replicated["servo"] = np.array([servo.asked, servo.strain, [servo.start] * 3, servo.rate, self.period])
-        return self.grains.columns(), replicated
+        return self.grains.columns(), replicated | self.passages.state() | self.cell.state()
 
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
@@ -153,7 +105,7 @@ class World:
     @property
     def ids(self) -> int:
         """Number of grains that there have been; their ids are less."""
-        return self.initial + sum(self.tallies[name].count for name in self.sources)
+        return self.initial + self.passages.came
 
     @property
     def body_count(self) -> int:

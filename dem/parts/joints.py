@@ -25,6 +25,7 @@ from dem import checks, quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.free_motion import free_spin, unequal
 from dem.motion import DROOP
+from dem.parts.cell import OPEN, Cell
 from dem.parts.named import Named
 from dem.parts.springs import End, Ends
 
@@ -97,15 +98,6 @@ class Joint(Named):
         return dataclasses.replace(self, **values)
 
 
-def whole_periods(way: Floats, period: Floats | None) -> Floats:
-    """The part (..., 3) of ways (..., 3) that is whole periods (3,) of the cell [m]; without it, ways lead to the
-    nearest image."""
-    if period is None:
-        return np.zeros_like(way)
-    cell = np.where(np.isfinite(period), period, 1.0)
-    return np.where(np.isfinite(period), cell * np.round(way / cell), 0.0)
-
-
 @dataclass(frozen=True)
 class Geometry:
     """Joints as they are: n of them."""
@@ -116,11 +108,10 @@ class Geometry:
 
 
 def geometry(
-    joints: Sequence[Joint], row: Ints, position: Floats, orientation: Floats, period: Floats | None = None
+    joints: Sequence[Joint], row: Ints, position: Floats, orientation: Floats, cell: Cell = OPEN
 ) -> Geometry:
     """Of joints between bodies in the rows `row` (n, 2), with positions (bodies, 3) [m] and quaternions (bodies, 4).
-    With a `period` (3,) of the cell [m] the second ends are those images whose anchors are nearest to the first
-    ones."""
+    The second ends are those images in the cell whose anchors are nearest to the first ones."""
     anchors, frames = (np.array([getattr(joint, name) for joint in joints]) for name in ("anchors", "frames"))
     turn = [quaternion.normalized(quaternion.multiply(orientation[row[:, k]], frames[:, k])) for k in (0, 1)]
     places = [position[row[:, k]] + quaternion.rotate(orientation[row[:, k]], anchors[:, k]) for k in (0, 1)]
@@ -135,7 +126,7 @@ def geometry(
     turned[hinge, 0], turned[hinge, 1] = -z[hinge, 1], z[hinge, 0]
     turned[hinge, 2] = 2.0 * np.arctan2(relative[hinge, 3], relative[hinge, 0])
     d = places[1] - places[0]
-    image = whole_periods(d, period)
+    image = cell.whole(d)
     d -= image
     error = np.concatenate([np.einsum("nij,nj->ni", axes, d), turned], axis=1)
     out = np.zeros((len(joints), 6, 2, 6))
@@ -182,9 +173,9 @@ class Coupling:
 
 
 def coupling(
-    joints: Sequence[Joint], row: Ints, ends: Ends, dt: float, period: Floats | None, push: Floats
+    joints: Sequence[Joint], row: Ints, ends: Ends, dt: float, cell: Cell, push: Floats
 ) -> Coupling:
-    """Of joints between bodies in the rows `row` (n, 2) in a step of dt [s], with the period of the cell, where
+    """Of joints between bodies in the rows `row` (n, 2) in a step of dt [s], in the cell, where
     contacts are expected to give the bodies the mass-scaled momenta `push` (n, 6).
 
     Motors that are too weak, and limits that are reached, are found without contacts, by an active set. What is not
@@ -192,7 +183,7 @@ def coupling(
     momentum of bodies that are no spheres, and the errors of joints at the end of the step. So joints hold there, as
     in the method SHAKE, with forces of the start of the step, and energy does not drift (Hairer, Lubich, Wanner,
     "Geometric Numerical Integration", section VII.1.4)."""
-    found = geometry(joints, row, ends.position, ends.quaternion, period)
+    found = geometry(joints, row, ends.position, ends.quaternion, cell)
     count = len(ends.free)
     chosen: list[tuple[int, int]] = []
     target, most, kinds = [], [], []
@@ -254,7 +245,7 @@ def coupling(
         if dt * np.abs(after[:, 3:]).max(initial=0.0) > FAR:
             break
         place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after[:, 3:], dt)
-        error = geometry(joints, row, place, turn, period).error
+        error = geometry(joints, row, place, turn, cell).error
         bent = (error - found.error)[which, ways] / dt - J.reshape(len(t), -1) @ after.ravel()
         t = np.where(held, left - bent, left)
     fixed = (J, B, root, which, ways, kind, t, bound, free, slip, found.axes)

@@ -6,15 +6,15 @@ these. So no generator has a state, and a run that goes on from a checkpoint has
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from dem import checks, quaternion, shapes
 from dem.arrays import Bools, Floats, Ints
-from dem.bodies import SPHERE, Bodies, enclosing_radius
+from dem.bodies import SPHERE, Bodies, concatenate, enclosing_radius, none
 from dem.measures import Block, Cylinder
 from dem.motion import Timed
 from dem.parts.named import Named
@@ -212,20 +212,101 @@ class Tally:
     refused: int = 0  #: steps in which the next grain of a source was due, but found no place
 
 
-def as_array(tallies: dict[str, Tally]) -> Floats:
-    """Rows (n, 4) of tallies, for `from_array`."""
-    rows = [[float(getattr(tally, field.name)) for field in fields(Tally)] for tally in tallies.values()]
-    return np.reshape(rows, (len(rows), 4))
+@dataclass(frozen=True)
+class Passages:
+    """The sources and outlets of a scene by name, and what has passed each of them up to now.
 
+    What comes and goes in a step is found by `dem.record.passage.come_and_go`; the rest asks these methods alone.
+    """
 
-def from_array(names: Sequence[str], rows: Floats) -> dict[str, Tally]:
-    """The tallies of these names. ValueError for rows that are none."""
-    if np.shape(rows) != (len(names), 4) or not (np.isfinite(rows).all() and (rows[:, [0, 1, 3]] >= 0.0).all()):
-        raise ValueError(f"the state has no counts of the sources and outlets {', '.join(names) or 'none'}")
-    return {
-        name: Tally(int(count), float(mass), float(energy), int(refused))
-        for name, (count, mass, energy, refused) in zip(names, rows)
-    }
+    sources: dict[str, Source] = field(default_factory=dict)
+    outlets: dict[str, Outlet] = field(default_factory=dict)
+    tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets
+
+    @property
+    def names(self) -> list[str]:
+        return [*self.sources, *self.outlets]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def add(self, name: str, part: Source | Outlet) -> None:
+        """Put a part under a name of its own; ValueError for another one."""
+        if not name or set(name) & set(',"\n') or name in self.names:
+            raise ValueError(f"sources and outlets need distinct names without commas, got {name!r}")
+        if isinstance(part, Source):
+            self.sources[name] = part
+        else:
+            self.outlets[name] = part
+
+    def counted(self) -> Passages:
+        """The same with tallies of its own, which are as these."""
+        tallies = {name: replace(self.tallies.get(name, Tally())) for name in self.names}
+        return Passages(dict(self.sources), dict(self.outlets), tallies)
+
+    @property
+    def came(self) -> int:
+        """Number of grains that have come."""
+        return sum(self.tallies[name].count for name in self.sources)
+
+    @property
+    def left(self) -> int:
+        """Number of grains that have left."""
+        return sum(self.tallies[name].count for name in self.outlets)
+
+    @property
+    def most(self) -> float:
+        """How many grains may come."""
+        return np.inf if self.sources else 0.0
+
+    def first_large(self, count: int) -> int:
+        """The id of the first large body of a scene with so many grains: more than that of any that may come."""
+        return MOST_IDS if self.sources else count
+
+    def extremes(self) -> Bodies:
+        """The grains that may come: of each source the smallest and the largest one."""
+        return concatenate([none(), *(source.extremes() for source in self.sources.values())])
+
+    def boxes(self) -> Floats:
+        """Lower and upper corners (sources, 2, 3) of the boxes about the regions in which grains come [m]."""
+        return np.array([bounds(source.region) for source in self.sources.values()]).reshape(-1, 2, 3)
+
+    @property
+    def density(self) -> float:
+        """The greatest of grains that may come; 0 without [kg/m^3]."""
+        return max((source.density for source in self.sources.values()), default=0.0)
+
+    def passed(self, what: str, name: str) -> Tally:
+        """What has passed the "source" or "outlet" of this name; ValueError if there is none."""
+        there: Mapping[str, Any] = self.sources if what == "source" else self.outlets
+        if name not in there:
+            raise ValueError(f"no {what} {name!r}; there are: {', '.join(there) or 'none'}")
+        return replace(self.tallies[name])
+
+    def record(self) -> dict[str, float]:
+        """What has passed each up to now, how many steps a source had no room, and the energies that came and went with
+        grains before this step [J]; nothing without."""
+        out: dict[str, float] = {}
+        for name, tally in self.tallies.items():
+            out |= {f"count_{name}": tally.count, f"mass_{name} [kg]": tally.mass}
+            if name in self.sources:
+                out[f"refused_{name}"] = tally.refused
+        for kind, names in (("sources", self.sources), ("outlets", self.outlets)) if out else ():
+            out[f"energy_of_{kind} [J]"] = sum(self.tallies[name].energy for name in names)
+        return out
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The arrays of a checkpoint, for `restored`."""
+        rows = [[float(getattr(tally, each.name)) for each in fields(Tally)] for tally in self.tallies.values()]
+        return {"tallies": np.array(rows)} if rows else {}
+
+    def restored(self, kept: Mapping[str, np.ndarray]) -> Passages:
+        """These of a scene, with the tallies of a checkpoint. ValueError if it has none of them."""
+        rows, names = np.array(kept.get("tallies", np.zeros((0, 4)))), self.names
+        if rows.shape != (len(names), 4) or not (np.isfinite(rows).all() and (rows[:, [0, 1, 3]] >= 0.0).all()):
+            raise ValueError(f"the state has no counts of the sources and outlets {', '.join(names) or 'none'}")
+        tallies = (Tally(int(count), mass, energy, int(refused)) for count, mass, energy, refused in rows.tolist())
+        return replace(self, tallies=dict(zip(names, tallies)))
 
 
 def bounds(region: Block | Cylinder) -> Floats:

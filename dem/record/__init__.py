@@ -18,8 +18,6 @@ from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
 from dem.exchange import reduced
 from dem.experiment import Experiment
-from dem.model.period import wrapped
-from dem.model.world import World
 from dem.motion import Held
 from dem.start import stiffness
 from dem.step import Step
@@ -32,7 +30,7 @@ def row(step: Step, scene: Experiment) -> dict[str, float]:
     """All quantities of a step by name, with units in brackets. SceneError if the scene's `record` fails or returns
     something else than numbers by name."""
     out = {"step": step.world.step, "time [s]": step.world.time}
-    out |= energy_balance(step) | contact_statistics(step) | passages(step.world)
+    out |= energy_balance(step) | contact_statistics(step) | step.world.passages.record()
     out |= cell(step)
     if scene.domain is not None:
         out["grains_outside"] = outside(step, *scene.domain)
@@ -68,35 +66,14 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
     return own
 
 
-def passages(world: World) -> dict[str, float]:
-    """What has passed each source and outlet up to now, how many steps a source had no room, and the energies that
-    came and went with grains before this step [J]; nothing of a scene without."""
-    out: dict[str, float] = {}
-    for name, tally in world.tallies.items():
-        out |= {f"count_{name}": tally.count, f"mass_{name} [kg]": tally.mass}
-        if name in world.sources:
-            out[f"refused_{name}"] = tally.refused
-    if out:
-        for kind, names in (("sources", world.sources), ("outlets", world.outlets)):
-            out[f"energy_of_{kind} [J]"] = sum(world.tallies[name].energy for name in names)
-    return out
-
-
 def cell(step: Step) -> dict[str, float]:
-    """The periods at the end of the step, and the stress of its contacts and grains; nothing of a scene that is neither
-    sheared nor has a servo, or has a direction without a period."""
-    world, period = step.world, step.world.period
-    if period is None or np.isinf(period).any() or (world.shear is None and world.servo is None):
-        return {}
-    stress = cell_stress(world, step.contacts, step.force)
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    out = {f"period_{axis} [m]": float(period[k]) for k, axis in enumerate("xyz")}
-    return out | {f"stress_{'xyz'[i]}{'xyz'[j]} [Pa]": 0.5 * float(stress[i, j] + stress[j, i]) for i, j in pairs}
+    """The size of the cell at the end of the step, and the stress of its contacts and grains."""
+    return step.world.cell.record(lambda: cell_stress(step.world, step.contacts, step.force))
 
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
-    place = wrapped(step.world.grains.position, step.world.period, step.world.shear)
+    place = step.world.cell.wrapped(step.world.grains.position)
     return step.total(outside_of(place, np.asarray(low, float), np.asarray(high, float)))
 
 

@@ -13,9 +13,8 @@ from dem.arrays import Bools, Floats
 from dem.bodies import PLANE, SPHERE, Bodies
 from dem.contact.primitives import primitives, touches
 from dem.geometry.insertion import inserted
-from dem.model.neighbourhood import Neighbourhood, image_ways, touched
+from dem.model.neighbourhood import Neighbourhood, touched
 from dem.model.partition import redistribute
-from dem.model.period import wrapped
 from dem.model.world import World
 from dem.parts.sources import MOST_IDS, Source, bounds, reach
 from dem.record import energy
@@ -27,24 +26,25 @@ PART = 256  #: grains that are placed at once
 def come_and_go(world: World) -> None:
     """Let grains leave and come, as they are due at the time of the world; collective. SceneError for a source that has
     used up all ids."""
-    if world.outlets:
+    world.passages = world.passages.counted()
+    if world.passages.outlets:
         _leave(world)
-    if world.sources:
+    if world.passages.sources:
         _come(world)
 
 
 def _leave(world: World) -> None:
     grains = world.grains
-    position, left = wrapped(grains.position, world.period), np.zeros(len(grains), bool)
-    sums = np.zeros((len(world.outlets), 3))
-    for row, outlet in enumerate(world.outlets.values()):
+    position, left = world.cell.wrapped(grains.position), np.zeros(len(grains), bool)
+    sums = np.zeros((len(world.passages.outlets), 3))
+    for row, outlet in enumerate(world.passages.outlets.values()):
         mine = outlet.takes(position) & ~left
         left |= mine
         table = grains.take(mine)
         sums[row] = len(table), table.mass.sum(), sum(energy(table, world.gravity))
     world.comm.Allreduce(MPI.IN_PLACE, sums)
-    for name, (count, mass, joule) in zip(world.outlets, sums):
-        tally = world.tallies[name]
+    for name, (count, mass, joule) in zip(world.passages.outlets, sums):
+        tally = world.passages.tallies[name]
         tally.count, tally.mass, tally.energy = tally.count + int(count), tally.mass + float(mass), float(joule)
     if sums[:, 0].any():
         world.set_grains(grains.take(~left))
@@ -52,19 +52,19 @@ def _leave(world: World) -> None:
 
 def _come(world: World) -> None:
     comm, ids = world.comm, world.ids
-    wanted = comm.bcast([name for name in world.sources if _due(world, name, PART)[1]])
-    for name in world.sources:
-        world.tallies[name].energy = 0.0
+    wanted = comm.bcast([name for name in world.passages.sources if _due(world, name, PART)[1]])
+    for name in world.passages.sources:
+        world.passages.tallies[name].energy = 0.0
     if not wanted:
         return
-    center, radius = _about(world, [world.sources[name] for name in wanted])
+    center, radius = _about(world, [world.passages.sources[name] for name in wanted])
     born: list[Bodies] = []
     if comm.rank == 0:
         for name in wanted:
             found, center, radius = _born(world, name, center, radius)
             born += found
-    tallies, count = comm.bcast(({name: world.tallies[name] for name in wanted}, sum(map(len, born))))
-    world.tallies |= tallies
+    tallies, count = comm.bcast(({name: world.passages.tallies[name] for name in wanted}, sum(map(len, born))))
+    world.passages.tallies.update(tallies)
     if ids + count > MOST_IDS:
         raise SceneError(f"step {world.step + 1}: sources have made more than {MOST_IDS} grains, which have no ids")
     if count:
@@ -79,7 +79,7 @@ def _come(world: World) -> None:
 
 def _due(world: World, name: str, most: int) -> tuple[Bodies, int]:
     """The next grains of a source, so many at most, and how many of them are due."""
-    source, tally = world.sources[name], world.tallies[name]
+    source, tally = world.passages.sources[name], world.passages.tallies[name]
     table = source.grains(name, tally.count + np.arange(most))
     return table, source.due(world.time, tally, table.mass)
 
@@ -90,9 +90,8 @@ def _about(world: World, sources: list[Source]) -> tuple[Floats, Floats]:
     boxes = np.array([bounds(source.region) for source in sources])
     largest = np.array([reach(source.extremes()).max() for source in sources])
     boxes += np.array([-1.0, 1.0])[None, :, None] * largest[:, None, None]
-    position, radius = wrapped(world.grains.position, world.period), reach(world.grains)
-    ways = [np.zeros(3)] if world.period is None else [np.zeros(3), *image_ways(world.period)[0]]
-    found = [touched(position + way, radius, boxes[None])[0] for way in ways]
+    position, radius = world.cell.wrapped(world.grains.position), reach(world.grains)
+    found = [touched(position + way, radius, boxes[None])[0] for way in world.cell.ways]
     rows = np.unique(np.concatenate(found)).astype(np.int64)
     parts = world.comm.gather((world.grains.id[rows], position[rows], radius[rows]))
     if parts is None:
@@ -106,13 +105,13 @@ def _born(world: World, name: str, center: Floats, radius: Floats) -> tuple[list
     """The grains that a source adds now among spheres of centres (m, 3) and radii (m,), and all of these spheres then;
     counted in the tally. Where the next grain finds no place, it and all after it wait, so that sizes keep their
     shares."""
-    source, tally, born = world.sources[name], world.tallies[name], []
+    source, tally, born = world.passages.sources[name], world.passages.tallies[name], []
     while True:
         table, count = _due(world, name, PART)
         place = source.places(name, tally.count + np.arange(count))
         table = table.take(slice(0, count))
         size = reach(table)
-        taken = inserted(place, _free(world, place, size), size, center, radius, world.period)
+        taken = inserted(place, _free(world, place, size), size, center, radius, world.cell.period)
         came = int((taken >= 0).sum())
         table = table.take(slice(0, came))
         table.position = place[np.arange(came), taken[:came]]
@@ -131,8 +130,7 @@ def _free(world: World, place: Floats, radius: Floats) -> Bools:
     free = np.ones(place.shape[:2], bool)
     if not len(world.large) or not free.size:
         return free
-    ways = [np.zeros(3)] if world.period is None else [np.zeros(3), *image_ways(world.period)[0]]
-    for way in ways:
+    for way in world.cell.ways:
         free &= _apart(world, place.reshape(-1, 3) + way, np.repeat(radius, place.shape[1])).reshape(free.shape)
     return free
 

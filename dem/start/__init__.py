@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
+from functools import partial
 
 import numpy as np
 from mpi4py import MPI
@@ -16,13 +17,13 @@ from dem.contact import find_contacts
 from dem.contact.primitives import refuse_untouchable
 from dem.exchange import exchange, refuse
 from dem.model.changes import refuse_load
+from dem.model.images import put_back
 from dem.model.partition import redistribute
-from dem.model.period import put_back, velocity_in_cell, wrapped
-from dem.model.world import Servo, Shear, World
-from dem.parts.sources import Tally, from_array
+from dem.model.world import World
 from dem.scene import Scene, least_half
 from dem.shapes.forms import Form
 from dem.start import stiffness
+from dem.together import together
 
 
 def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
@@ -33,10 +34,7 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     """
     scene.survey(comm)
     rows = even_slice(scene.count, comm)
-    grains = scene.grains(rows.start, rows.stop)
-    grains.velocity = velocity_in_cell(grains.position, grains.velocity, _shear(scene))
-    grains.position = wrapped(grains.position, scene.period, _shear(scene))
-    world = _world(scene, comm, grains)
+    world = _world(scene, comm, scene.cell.inside(scene.grains(rows.start, rows.stop)))
     world.put_large(world.poses(0.0))
     put_back(world)
     redistribute(world)
@@ -62,9 +60,10 @@ def restored_world(
     ]
     refuse(comm, f"arrays of other shapes or types: {', '.join(other)}" if other else "")
     world = _world(scene, comm, Bodies(**{name: np.array(column) for name, column in local.items()}))
-    if world.tallies:
-        world.tallies = from_array([*world.tallies], np.array(replicated.get("tallies", ())))
-    count = world.ids - sum(world.tallies[name].count for name in world.outlets)
+    for part in ("passages", "cell"):
+        restored = partial(getattr(world, part).restored, replicated)
+        setattr(world, part, together(comm, f"restored {part}", restored, own=(ValueError,)))
+    count = world.ids - world.passages.left
     if world.slabs[-1] != count or len(large["id"]) != len(world.large):
         raise ValueError(
             f"the state has {world.slabs[-1]} grains and {len(large['id'])} large bodies, "
@@ -75,7 +74,6 @@ def restored_world(
     expected = np.array(replicated["expected"]) if "expected" in replicated else None
     world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
     world.spare = float(replicated["spare"])
-    _restore_cell(world, replicated)
     _refuse_impossible(world)
     if len(replicated["slabs"]) != comm.size + 1:
         redistribute(world)
@@ -107,7 +105,7 @@ def _refuse_impossible(world: World) -> None:
     owner = np.clip(np.searchsorted(starts, world.grains.id, side="right") - 1, 0, world.comm.size - 1)
     ids = np.sort(exchange(world.comm, {"id": world.grains.id}, owner)["id"])
     most = starts[world.comm.rank : world.comm.rank + 2]
-    missing = not world.outlets and len(ids) != most[1] - most[0]
+    missing = not world.passages.left and len(ids) != most[1] - most[0]
     if missing or (np.diff(ids) <= 0).any() or ((ids < most[0]) | (ids >= most[1])).any():
         wrong.append("id of a grain")
     refuse(world.comm, f"a state that no run can have: {', '.join(wrong)}" if wrong else "")
@@ -131,51 +129,23 @@ def even_slice(count: int, comm: MPI.Comm) -> slice:
     return slice(count * comm.rank // comm.size, count * (comm.rank + 1) // comm.size)
 
 
-def _shear(scene: Scene) -> Shear | None:
-    """The shear of the cell at time zero."""
-    if scene.shear_rate is None or scene.period is None:
-        return None
-    return Shear(scene.shear_rate, scene.gradient, float(scene.period[scene.gradient]))
-
-
-def _restore_cell(world: World, replicated: Mapping[str, np.ndarray]) -> None:
-    """Take the shear, the servo and the periods of the cell from a state; ValueError on all ranks if it has none."""
-    comm = world.comm
-    if world.servo is not None:
-        servo = np.array(replicated.get("servo", np.full((5, 3), np.nan)), float)
-        right = servo.shape == (5, 3) and np.isfinite(servo[2:]).all() and (servo[4] > 0.0).all()
-        refuse(comm, "" if right else "the state has no stress or strain rate of the cell, as the scene has")
-        world.servo, world.period = Servo(servo[0], servo[1], float(servo[2, 0]), servo[3]), servo[4]
-    if world.shear is not None and world.period is not None:
-        rate, shift = np.array(replicated.get("shear", (0.0, np.nan)), float)
-        refuse(comm, "" if np.isfinite([rate, shift]).all() else "the state has no shear of the cell, as the scene has")
-        length = float(world.period[world.shear.axis])
-        world.shear = replace(world.shear, rate=float(rate), shift=float(shift), length=length)
-
-
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
-    world.loads, world.springs, world.period = dict(scene.loads), dict(scene.springs), scene.period
+    world.loads, world.springs, world.cell = dict(scene.loads), dict(scene.springs), scene.cell
     world.forms = tuple(scene.forms)
     refuse_untouchable(scene.kinds, scene.large_bodies)
-    world.sources, world.outlets = dict(scene.sources), dict(scene.outlets)
-    world.tallies = {name: Tally() for name in (*world.sources, *world.outlets)}
+    world.passages = scene.passages.counted()
     world.initial, world.first_large = scene.count, scene.first_large
     for what, members in (("spring", world.springs), ("joint", scene.joints)):
         tied = [name for name, member in members.items() if any(isinstance(end, int) for end in member.ends)]
-        if tied and world.outlets:
+        if tied and world.passages.outlets:
             raise ValueError(f"{what} {tied[0]!r} holds a grain: with outlets {what}s may hold large bodies alone")
-    world.shear = _shear(scene)
     world.joints = dict(scene.joints)
     number = {body.name: int(id) for body, id in zip(world.large_bodies, world.large.id)}
     ends = [joint.ends for joint in world.joints.values() if None not in joint.ends and not joint.touching]
     ids = [sorted(end if isinstance(end, int) else number[str(end)] for end in pair) for pair in ends]  # type: ignore[index]
     world.apart = np.unique(np.array(ids, float).reshape(-1, 2) @ [1.0, 1.0j])
-    if scene.deforms:
-        none = np.full(3, np.nan)
-        asked, strain = (none if given is None else given for given in (scene.stress, scene.strain_rate))
-        world.servo = Servo(asked, strain, scene.strain_start)
     for name, load in world.loads.items():
         refuse_load(world, name, load)
     return world

@@ -17,7 +17,6 @@ from dem import bodies, quaternion, shapes
 from dem.arrays import Floats
 from dem.bodies import BOX, CAPSULE, MESH, PLANE, Bodies
 from dem.motion import Dynamic
-from dem.parts.sources import bounds
 from dem.scene import LargeBody, Scene
 from dem.shapes import Plane, Shape, placed
 
@@ -50,7 +49,7 @@ def fall(scene: Scene, acceleration: Floats, start: float = 0.0) -> Fall:
     halves = bodies.least_half_thickness(every)
     half = float(halves.min())
     first, gap, column = 0.0, np.inf, 0.0
-    lasts = [_last(_corners(*bounds(source.region)), along, planes, levels) for source in scene.sources.values()]
+    lasts = [_last(_corners(*box), along, planes, levels) for box in scene.passages.boxes()]
     if grains.count:
         corners = _corners(grains.low, grains.high)
         bed, gap, column = _bed(scene, along, every)

@@ -102,7 +102,7 @@ def _tools(scene: Scene) -> tuple[float, list[tuple[float, float]]]:
     come that meet a few grains alone, or none. Beneath a wide one a bed gives way, the more so if it is a servo."""
     greatest, impacts = 0.0, []
     radius = float(bodies.bounding_radius(scene.expected()).min())
-    count, falls = np.inf if scene.sources else float(scene.count), math.hypot(*scene.gravity)
+    count, falls = scene.count + scene.passages.most, math.hypot(*scene.gravity)
     for body in scene.large_bodies:
         motion = body.motion
         if not isinstance(motion, Dynamic):

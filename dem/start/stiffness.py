@@ -35,7 +35,6 @@ from dem.arrays import ArrayLike, Floats, Ints
 from dem.compiled import inlined, loop
 from dem.motion import Dynamic
 from dem.parts.contact_law import ContactLaw
-from dem.parts.sources import bounds
 from dem.scene import Scene
 from dem.shapes import Plane, placed
 from dem.start.falls import DENSE, area, fall
@@ -247,7 +246,7 @@ def _load(scene: Scene, pressed: Pressing) -> Floats:
     the strongest cohesion (n,) [N]."""
     every, gravity = scene.expected(), math.hypot(*scene.gravity)
     pull = scene.pairs(np.inf).cohesion.max()
-    pressure = 0.0 if scene.stress is None else float(np.nan_to_num(scene.stress).max())
+    pressure = scene.cell.pressure
     if gravity > 0.0:
         down = np.asarray(scene.gravity) / gravity
         pressure = max(_pressure(scene, gravity, down), _bed(scene, gravity, down))
@@ -271,14 +270,13 @@ def _pressure(scene: Scene, gravity: float, down: Floats) -> float:
 def _bed(scene: Scene, gravity: float, down: Floats) -> float:
     """The pressure [Pa] at the bottom of a dense bed that reaches from the lowest body to the highest source: no source
     fills a scene further than that. 0 without sources."""
-    if not scene.sources:
+    top = scene.passages.boxes() @ down
+    if not len(top):
         return 0.0
-    top = [bounds(source.region) @ down for source in scene.sources.values()]
     places = [body.position + quaternion.rotate(body.quaternion, placed(shape)[1])
               for body in scene.large_bodies for shape in body.shapes]  # fmt: skip
     reach = [0.0 if isinstance(shape, Plane) else float(np.linalg.norm(placed(shape)[3]))
              for body in scene.large_bodies for shape in body.shapes]  # fmt: skip
     low = [place @ down + far for place, far in zip(places, reach)] + [ends.max() for ends in top]
     height = max(low) - min(ends.min() for ends in top)
-    heaviest = max(source.density for source in scene.sources.values())
-    return DENSE * heaviest * gravity * height
+    return DENSE * scene.passages.density * gravity * height

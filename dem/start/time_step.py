@@ -24,9 +24,6 @@ from dem.start.turns import TURN, turning_of_large
 DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/choose.md has the errors of forces
 FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
 FALLS = 1.5  #: the way in a step, in radii, of a grain that has fallen; two are the limit of `dem.step.fast`
-SHEARED = 0.01  #: the shear strain of a cell in a step
-STRAINED = 0.002  #: the strain of its periods in a step
-PASSING = 0.1  #: the step, in the time d sqrt(rho / P) in which the stress of a cell closes a hole
 SPRINGS = 0.2  #: the step times the highest frequency of springs; 2 is their limit
 PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same and steps take a quarter longer
 
@@ -50,7 +47,7 @@ def needs(scene: Scene) -> dict[str, float]:
         found[f"falls to {falls:.3g} m/s"] = _rounded(FALLS * smallest(scene) / falls)
     if pushed > math.hypot(*scene.gravity):
         found[f"loads of {pushed:.3g} m/s^2"] = _rounded(FALLING * math.sqrt(smallest(scene) / pushed))
-    found.update(for_cell(scene))
+    found |= {what: _rounded(dt) for what, dt in scene.cell.needs(scene.expected()).items()}
     if (spin := fastest_turn(scene)) > 0.0:
         found[f"bodies that turn at {spin:.3g} rad/s"] = _rounded(TURN / spin)
     if pressed.highest > 0.0:
@@ -83,20 +80,6 @@ def falling(scene: Scene, pressed: Pressing) -> float:
 def for_settling(scene: Scene) -> float:
     """The time step [s] in which grains fall and come to rest; 0.01 s without gravity."""
     return _rounded(FALLING * _fall(scene))
-
-
-def for_cell(scene: Scene) -> dict[str, float]:
-    """The time steps [s] that the motion of a cell and its stress need."""
-    found, every = {}, scene.expected()
-    if scene.shear_rate:
-        found[f"a shear rate of {scene.shear_rate:.3g} 1/s"] = _rounded(SHEARED / abs(scene.shear_rate))
-    if scene.strain_rate is not None and (rate := float(np.abs(np.nan_to_num(scene.strain_rate)).max())) > 0.0:
-        found[f"a strain rate of {rate:.3g} 1/s"] = _rounded(STRAINED / rate)
-    if scene.stress is not None and (pressure := float(np.nan_to_num(scene.stress).max())) > 0.0 and len(every):
-        thick, wide = 2.0 * bodies.least_half_thickness(every), 2.0 * bodies.bounding_radius(every)
-        square = 6.0 / np.pi * thick * every.mass / wide**2 / pressure  # d^2 rho / P of a sphere
-        found[f"a stress of {pressure:.3g} Pa"] = _rounded(PASSING * float(np.sqrt(square.min())))
-    return found
 
 
 def contact_distance(scene: Scene) -> float:

@@ -14,11 +14,10 @@ import numpy as np
 from dem import bodies, quaternion
 from dem.arrays import ArrayLike, Bools, Floats, Ints, places
 from dem.bodies import SPHERE, Bodies
-from dem.contact import Contacts, cell_way, contact_order, find_contacts, goes_beyond, velocities_about, ways
+from dem.contact import Contacts, contact_order, find_contacts, goes_beyond, velocities_about, ways
 from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
 from dem.measures import Sample
-from dem.model.period import before, lattice, resize, velocity_in_cell, wrapped
 from dem.model.world import World
 from dem.step.cohesion import along_normal
 from dem.step.system import ContactSystem, contact_arms, contact_frames, gap_velocities
@@ -95,28 +94,26 @@ class Step:
     @cached_property
     def point(self) -> Floats:
         """The points (nc, 3) of the contacts at the start of the step, in the cell that there was [m]."""
-        return wrapped(self.contacts.point, *before(self.world, self.system.dt))
+        return self.world.cell.before(self.system.dt).wrapped(self.contacts.point)
 
     @cached_property
     def sample(self) -> Sample:
         """This rank's grains and contacts for the functions of `dem.measures`; not collective."""
-        contacts, grains, near = self.contacts, self.world.grains, self.contacts.near.bodies
+        contacts, grains, near = self.contacts, self.world.cell.inside(self.world.grains), self.contacts.near.bodies
         pair = np.stack([contacts.a, contacts.b], axis=1)
         center = near.position[pair]
         if contacts.moved is not None:
             center[:, 1] += contacts.moved
             center += (self.point - contacts.point)[:, None]
-        way, drift = lattice(self.world.period, self.world.shear)
+        way, drift = self.world.cell.lattice
         number, first, count = near.id[pair], self.world.first_large, self.world.ids
-        names = ("id", "mass", "shape", "size", "material")
+        names = ("id", "position", "velocity", "mass", "shape", "size", "material")
         return Sample(
             comm=self.world.comm,
             count=count,
             **{name: getattr(grains, name) for name in names},
             materials=self.world.materials,
             bodies=np.where(number < first, number, number - first + count),
-            velocity=velocity_in_cell(grains.position, grains.velocity, self.world.shear),
-            position=wrapped(grains.position, self.world.period, self.world.shear),
             center=center,
             point=self.point,
             normal=contacts.normal,
@@ -153,13 +150,11 @@ def advance(
     if contacts.lag is not None:
         world.grains.position = world.grains.position + contacts.lag
     world.lists, world.grains.weight = contacts.lists, contacts.owned
-    if world.servo is not None:
-        world.grains.position = world.grains.position + dt * world.servo.rate * start
+    if world.cell.deforms:
+        world.grains.position = world.grains.position + dt * world.cell.rate * start
     if free.applied is not None:
         world.expected = free.applied.expected
-    if world.shear is not None:
-        world.shear = world.shear.after(dt)
-    resize(world, dt)
+    world.cell = world.cell.after(dt)
     world.time += dt
     world.step += 1
     world.put_large(free.poses)
@@ -190,7 +185,7 @@ def find_overrun(
     """
     dt, seen = free.dt, contacts.near.margin[: contacts.near.grains]
     way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
-    way = way + cell_way(world, dt)
+    way = way + world.cell.margin(dt, world.grains)
     large = large_velocity(world, free, velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
     gone = bool((way > seen).any()), goes_beyond(world, dt * large, contacts.shifts, delta)
@@ -213,7 +208,7 @@ def _opening(world: World, contacts: Contacts, position: Floats, velocity: Float
     row = np.stack([contacts.a, contacts.b], axis=1).astype(np.uint32)
     arm = contact_arms(contacts, position, row)
     opening: Floats = relative_velocities(contact_frames(contacts.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
-    flow = contacts.flow(world, position)
+    flow = contacts.flow(world.cell, position)
     return opening if flow is None else opening + np.einsum("ci,ci->c", contacts.normal, flow)
 
 
@@ -281,12 +276,12 @@ def _at_start(world: World, end: Contacts, dt: float) -> tuple[Contacts, Floats]
     velocity = end.near.bodies.velocity
     start = replace(end, point=end.point - 0.5 * dt * (velocity[end.a, :3] + velocity[end.b, :3]))
     position = end.near.bodies.position - dt * velocity[:, :3]
-    flow = end.flow(world, end.near.bodies.position)
+    flow = end.flow(world.cell, end.near.bodies.position)
     if flow is not None and end.moved is not None:
         start = replace(start, point=start.point - 0.5 * dt * flow, moved=end.moved - dt * flow)
     growth = dt * _opening(world, start, position, velocity)
-    if world.servo is not None and start.moved is not None:
-        way = dt * world.servo.rate * position  # of the centres, which the cell takes with it
+    if world.cell.deforms and start.moved is not None:
+        way = dt * world.cell.rate * position  # of the centres, which the cell takes with it
         start = replace(start, point=start.point - way[end.a], moved=start.moved + way[end.b] - way[end.a])
     return replace(start, gap=end.gap - growth), growth
 

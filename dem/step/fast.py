@@ -97,7 +97,7 @@ def _meet(world: World, contacts: Contacts, table: Floats, delta: float, dt: flo
     spin[shape == SPHERE] = 0.0  # their surfaces do not move
     way = dt * (table[row, :3] + spin)
     way = way[:, 1] - way[:, 0]
-    if (flow := contacts.flow(world, near.bodies.position)) is not None:
+    if (flow := contacts.flow(world.cell, near.bodies.position)) is not None:
         way += dt * flow
     closes: Bools = contacts.linear_gap + np.einsum("ci,ci->c", way, contacts.normal) < -0.01 * delta
     balls = (shape == SPHERE).all(axis=1)

@@ -52,7 +52,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     faster than a fall of one step; without restitution those of two that are near no other. Two spheres that pass each
     other have no contact that closes. In cells that deform, and where bodies attract each other, nothing is
     followed."""
-    if world.shear is not None or world.servo is not None or world.pairs.cohesion.any():
+    if world.cell.moves or world.pairs.cohesion.any():
         return contacts
     near, table, pairs, dt = contacts.near, contacts.near.bodies, world.pairs, motion.dt
     grains, old = near.grains + near.ghosts, table.velocity
@@ -63,11 +63,11 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     if pairs.restitution.any():
         old = old.copy()
         old[grains:] = motion.prescribed
-    period = np.full(3, np.inf) if world.period is None else world.period
+    image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     slow, radius = dt * math.hypot(*world.gravity), np.ascontiguousarray(table.size[:, 0])
     kind, bounce, offset, marked = struck(
         contacts.a, contacts.b, contacts.normal, contacts.gap, contacts.linear_gap, ball, table.mass, radius,
-        table.material, pairs.restitution, pairs.stiffness, grains, table.position, old, period, dt, slow,
+        table.material, pairs.restitution, pairs.stiffness, grains, table.position, old, image, dt, slow,
     )  # fmt: skip
     if not on_any(world.comm, bool(marked.any()))[0]:
         return contacts
@@ -149,11 +149,12 @@ def _reached(world: World, contacts: Contacts, pairs: Ints, marked: Bools) -> Bo
 def struck(
     one: Ints, two: Ints, normal: Floats, gap: Floats, linear: Floats, ball: Bools, mass: Floats, radius: Floats,
     material: Ints, restitution: Floats, stiffness: Floats, grains: int, place: Floats, velocity: Floats,
-    period: Floats, dt: float, slow: float,
+    image: Floats, dt: float, slow: float,
 ) -> tuple[Ints, Floats, Floats, Bools]:  # fmt: skip
     """Of contacts (nc,) of bodies in the rows `one` and `two` the kinds (nc,), the coefficients of restitution (nc,)
-    and the ways from the second bodies to their images (nc, 3); and which bodies (rows,) meet by the velocities before
-    the step, or pass each other while the linear gap closes. Those that press others that they touch are left out."""
+    and the ways from the second bodies to their images (nc, 3), of spheres `image`; and which bodies (rows,) meet by
+    the velocities before the step, or pass each other while the linear gap closes. Those that press others that they
+    touch are left out."""
     count = len(one)
     kind, bounce, offset = np.full(count, OTHER), np.empty(count), np.zeros((count, 3))
     meets, passes, marked = np.zeros(count, np.bool_), np.zeros(count, np.bool_), np.zeros(len(place), np.bool_)
@@ -170,9 +171,7 @@ def struck(
         if ball[a] and b >= grains and e > 0.0 and np.isinf(mass[b]):
             kind[c], meets[c] = WALL, closes and dot(v, n) < -slow
         elif ball[a] and ball[b] and (e > 0.0 or (many[a] == many[b] == 1 and _is_short(k, mass, a, b, dt))):
-            for i in range(3):
-                if np.isfinite(period[i]):
-                    offset[c, i] = -period[i] * np.rint((place[b, i] - place[a, i]) / period[i])
+            offset[c] = image[c]
             time, speed = _meeting(_way(place, a, b, offset, c), v, radius[a] + radius[b])
             kind[c], meets[c] = PAIR, time <= dt and speed < -slow
             passes[c] = closes and not closed

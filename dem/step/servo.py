@@ -24,7 +24,7 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Floats
 from dem.contact import Contacts
-from dem.contact_map.mass import Cell
+from dem.contact_map.mass import CellStep
 from dem.model.world import World
 
 CLOSING = 0.01  #: rate times d sqrt(rho / P): a loose cell closes in quasistatic motion
@@ -35,45 +35,40 @@ KEPT = 0.9
 def cell_stress(world: World, contacts: Contacts, force: Floats) -> Floats:
     """Stress (3, 3) of a cell with three periods after a step, of the forces (nc, 3) [N] of its contacts (Love, Weber)
     and of the motion of the grains beside that of the cell, positive in compression [Pa]; collective."""
-    assert world.period is not None
     borne = world.comm.allreduce(force.T @ contacts.way(contacts.near.bodies.position))
-    stress: Floats = borne / world.period.prod() + _motion(world)[0]
+    stress: Floats = borne / world.cell.volume + _motion(world)[0]
     return stress
 
 
 def _motion(world: World) -> tuple[Floats, float]:
     """The stress (3, 3) of the motion of the grains [Pa], and the time d sqrt(rho) of their mean diameter and mass
     [s sqrt(Pa)]; collective."""
-    assert world.period is not None
     grains = world.grains
-    speed = grains.velocity[:, :3].copy()
-    if world.shear is not None:
-        speed[:, 0] -= world.shear.rate * grains.position[:, world.shear.axis]
+    speed = world.cell.beside_flow(grains.position, grains.velocity[:, :3])
     sums = np.zeros((5, 3))
     sums[:3], sums[3] = (speed.T * grains.mass) @ speed, grains.mass @ speed
     sums[4, :2] = grains.mass.sum(), 2.0 * bodies.bounding_radius(grains).sum()
     sums = world.comm.allreduce(sums)
     mass, size = sums[4, :2] / world.slabs[-1]
-    stress = (sums[:3] - np.outer(sums[3], sums[3]) / sums[4, 0]) / world.period.prod()
+    stress = (sums[:3] - np.outer(sums[3], sums[3]) / sums[4, 0]) / world.cell.volume
     return stress, float(np.sqrt(6.0 / np.pi * mass / size))
 
 
-def cell_of(world: World, contacts: Contacts, frame: Floats, dt: float) -> Cell | None:
+def cell_of(world: World, contacts: Contacts, frame: Floats, dt: float) -> CellStep | None:
     """How the cell takes part in a step from contacts with the frames (nc, 3, 3); None where its size is constant;
     collective."""
-    servo = world.servo
-    if servo is None or world.period is None:
+    cell = world.cell
+    if not cell.deforms:
         return None
-    given = servo.given_at(world.time, dt)
-    follows = np.isnan(given) & ~np.isnan(servo.asked)
-    asked = np.where(follows, servo.asked, 0.0)
+    given = cell.given_at(world.time, dt)
+    follows = np.isnan(given) & ~np.isnan(cell.stress)
+    asked = np.where(follows, cell.stress, 0.0)
     stress, time = _motion(world)
-    shear = 0.0 if world.shear is None else abs(world.shear.rate)
-    leads = shear + float(np.abs(np.nan_to_num(given)).max())
+    leads = abs(cell.shear_rate) + float(np.abs(np.nan_to_num(given)).max())
     fastest = CLOSING * np.sqrt(asked.max()) / time + LEADING * leads
     eta = np.where(follows, asked / max(fastest, 1e-300), 1.0)
-    root = np.where(follows, 1.0 / np.sqrt(eta * dt * world.period.prod()), 0.0)
-    kept = np.clip(KEPT * servo.rate, -leads, leads)
+    root = np.where(follows, 1.0 / np.sqrt(eta * dt * cell.volume), 0.0)
+    kept = np.clip(KEPT * cell.rate, -leads, leads)
     free = np.where(follows, kept + (np.diag(stress) - asked) / eta, np.nan_to_num(given))
     way = contacts.way(contacts.near.bodies.position)
-    return Cell((frame * way[:, None]).reshape(-1, 9), root, free)
+    return CellStep((frame * way[:, None]).reshape(-1, 9), root, free)

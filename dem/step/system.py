@@ -67,7 +67,7 @@ class ContactSystem:
         spring; 0: rigid [1/kg]
         last (nc,), held (nc, 2): the normal impulses of the last step, and what tangential springs hold at the start of
         this one [N s]
-        cell: its part in the step, a `dem.contact_map.mass.Cell`; None where its size is constant
+        cell: its part in the step, a `dem.contact_map.mass.CellStep`; None where its size is constant
         drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
         last step, in a cell that deforms [m/s]
         surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.step.surface`; None if there is none
@@ -276,13 +276,13 @@ class ContactSystem:
         """Give a cell that deforms the rate of its periods in this step, for the momenta of `velocity_with`;
         collective."""
         mass = self.contact_map.mass
-        if isinstance(mass, CellMass) and world.servo is not None:
+        if isinstance(mass, CellMass):
             rate = mass.rate_of(momentum.reshape(-1, 6) + self._attracted)
-            world.servo = replace(world.servo, rate=mass.cell.free + rate)
+            world.cell = replace(world.cell, rate=mass.cell.free + rate)
 
     def take_flow(self, world: World, contacts: Contacts) -> None:
         """Take the drift of the contacts from the shear and the rate of the cell."""
-        flow = contacts.flow(world, contacts.near.bodies.position)
+        flow = contacts.flow(world.cell, contacts.near.bodies.position)
         self.drift = None if flow is None else np.einsum("cij,cj->ci", self.frame, flow)
 
     def impulse_on_large(self, impulse: Floats, moment: Floats | None = None) -> Floats:

@@ -133,7 +133,7 @@ def joint_coupling(world: World, free: UnconstrainedMotion, push: Floats | None 
         here, slot = slots(world, id)
         gathered[slot] = push[here]
         world.comm.Allreduce(MPI.IN_PLACE, gathered)
-    given = list(world.joints.values()), row, table, free.dt, world.period, gathered
+    given = list(world.joints.values()), row, table, free.dt, world.cell, gathered
     found = joints.coupling(*given) if world.comm.rank == 0 else None
     return world.comm.bcast(found)  # processors may round in other ways
 
@@ -161,4 +161,4 @@ def joints_now(world: World) -> tuple[joints.Geometry, Floats]:
     tools = np.concatenate([large.position, large.quaternion, large.velocity], axis=1)
     rest = np.concatenate([np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], np.zeros((1, 6))], axis=1)
     position, turn, velocity = np.split(np.concatenate([gathered, tools, rest]), [3, 7], axis=1)
-    return joints.geometry(list(world.joints.values()), row, position, turn, world.period), velocity[row]
+    return joints.geometry(list(world.joints.values()), row, position, turn, world.cell), velocity[row]

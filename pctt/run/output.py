@@ -24,7 +24,6 @@ from mpi4py import MPI
 from dem import bodies
 from dem.exchange import exchange
 from dem.experiment import Experiment
-from dem.model.period import lattice, velocity_in_cell, wrapped
 from dem.model.world import World
 from dem.motion import Dynamic
 from dem.scene import least_half
@@ -143,7 +142,7 @@ class Writer:
         self._kept_steps = world.step if place.goes_on else 0
         self._begun = self._stands = self._stale = False
         self.analysis: dict[str, float] | None = None  #: the scene's numbers of all steps so far
-        tables = [world.grains, *(source.extremes() for source in world.sources.values())]
+        tables = world.grains, world.passages.extremes()
         smallest = min(float(bodies.least_half_thickness(table).min(initial=np.inf)) for table in tables)
         radius = self.comm.allreduce(smallest, MPI.MIN)
         if np.isinf(radius):
@@ -200,7 +199,7 @@ class Writer:
                 write_rows(table, self.comm, rows, shared, {})
         near = contacts.near.bodies
         rows = {
-            **_by_id(world, (*PLACES, *(TABLE if world.tallies else ()))),
+            **_by_id(world, (*PLACES, *(TABLE if world.passages else ()))),
             "contact/key": contacts.key,
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
             "contact/point": step.point,
@@ -211,10 +210,7 @@ class Writer:
         }
         if (moments := step.moments) is not None:
             rows["contact/moment"] = moments
-        top: dict[str, Any] = {"step": world.step, "time": world.time}
-        if world.period is not None:
-            top["lattice"], top["drift"] = lattice(world.period, world.shear)
-            top["rate"] = np.zeros(3) if world.servo is None else world.servo.rate
+        top = {"step": world.step, "time": world.time, **world.cell.attributes()}
         about = {"/": top, "record": row, "contact": {"dt": step.system.dt}}
         write_rows(frames / f"{world.step:06d}.h5", self.comm, rows, {}, about)
         self._recorded = world.step
@@ -327,12 +323,8 @@ def described_forms(world: World) -> list[dict[str, Any]]:
 
 def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Columns of the table of all bodies, in the order of their ids, spread over the ranks; collective."""
-    grains, comm = world.grains, world.comm
+    grains, comm = world.cell.inside(world.grains), world.comm
     columns = {"id": grains.id, **{name: getattr(grains, name) for name in names}}
-    if "position" in columns:
-        if "velocity" in columns:
-            columns["velocity"] = velocity_in_cell(columns["position"], columns["velocity"], world.shear)
-        columns["position"] = wrapped(columns["position"], world.period, world.shear)
     starts = np.arange(comm.size + 1) * world.ids // comm.size
     rows = exchange(comm, columns, np.searchsorted(starts, grains.id, side="right") - 1)
     order, last = np.argsort(rows["id"]), comm.rank == comm.size - 1

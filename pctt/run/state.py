@@ -68,18 +68,14 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     large = scene.large_bodies
     motions = [(body.name, type(body.motion).__name__) for body in large]
     words: list[Any] = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
-    words += [repr(scene.sources), repr(scene.outlets)]
+    words.append(repr(scene.passages))
     words.append([(part.count, part.kind, part.material) for part in scene.parts])
     words.append([(name, repr(joint)) for name, joint in scene.joints.items()])
     numbers: list[Any] = [column.sample() for part in scene.parts for column in part.given.values()]
     numbers += scene.large().columns().values()
     numbers += [value for body in large for shape in body.shapes for value in placed(shape)]
     numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values(), *(body.surface for body in large)]
-    numbers += [-np.inf if scene.shear_rate is None else scene.shear_rate, scene.gradient]
-    of_cell = (scene.stress, scene.strain_rate)
-    numbers += [np.full(3, -np.inf) if given is None else np.nan_to_num(given) for given in of_cell]
-    numbers += [scene.strain_start]
-    for part in (*(body.motion for body in large), *scene.springs.values(), *scene.loads.values()):
+    for part in (scene.cell, *(body.motion for body in large), *scene.springs.values(), *scene.loads.values()):
         numbers += getattr(part, "__dict__", {}).values()
     return repr(words), [value for value in map(np.asarray, numbers) if value.dtype.kind in "fiub"]
 

@@ -14,8 +14,8 @@ from mpi4py import MPI
 from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
 from dem.exchange import reduced
+from dem.model.images import put_back
 from dem.model.partition import rebalance
-from dem.model.period import put_back
 from dem.model.world import World
 from dem.record.passage import come_and_go
 from dem.step import Step, advance, carried, find_overrun, find_turned
@@ -66,7 +66,7 @@ class Stepper:
         self._slabs: Ints | None = None  # those of the last step, whose impulses the memory has
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
-        if world.servo is not None and not np.isfinite(world.pairs.stiffness).all():
+        if world.cell.deforms and not np.isfinite(world.pairs.stiffness).all():
             raise OptionError("-stiffness inf: a cell of given stress needs contacts that give way; allowed is less")
 
     def __enter__(self) -> Stepper:
@@ -99,7 +99,7 @@ class Stepper:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
         given, found, result, eased, smooth, turned, shown = self.settings, None, None, None, False, 0, 0
         with log.phase("search"):
-            come_and_go(world)  # outlets take, sources add
+            come_and_go(world)  # grains that leave, and those that are due
             put_back(world)  # into the periodic cell
             rebalance(world)
             free = unconstrained(world, given.dt)  # gravity, spin, loads, springs, drives, motions

@@ -13,11 +13,11 @@ from dem.arrays import Floats
 from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
 from dem.packing import perturbed, random_packing
+from dem.parts.cell import PASSING, SHEARED
 from dem.parts.sources import Uniform
 from dem.record import cell
 from dem.record.analysis import calm
 from dem.scene import Scene
-from dem.start.time_step import PASSING, SHEARED
 from dem.step import Step
 
 
@@ -98,8 +98,7 @@ class PlaneShear(Experiment):
     def record(self, step: Step) -> dict[str, float]:
         """Shear strain, friction coefficient of the flow, inertial number by the stress that there is, and solid
         fraction, of a layer the part of the area."""
-        of_cell, shear = cell(step), step.world.shear
-        rate = 0.0 if shear is None else shear.rate
+        of_cell, rate = cell(step), step.world.cell.shear_rate
         pressure, radius = max(of_cell["stress_zz [Pa]"], 1e-300), step.world.grains.size[:, 0]
         room, filled = of_cell["period_x [m]"] * of_cell["period_z [m]"], pi * radius**2
         if not self.layer:

@@ -11,6 +11,7 @@ how many calls of functions of the feature's modules a step without it makes, by
 from __future__ import annotations
 
 import cProfile
+import dataclasses
 import pstats
 import time
 from collections.abc import Callable
@@ -91,7 +92,7 @@ def flow(at_rest: bool = False, constant: bool = False) -> pctt.Simulation:
     if at_rest:
         sim.change("cell", shear_rate=0.0)
     if constant:
-        sim.world.servo = None
+        sim.world.cell = dataclasses.replace(sim.world.cell, deforms=False, rate=np.zeros(3))
     return sim
 
 
@@ -121,7 +122,7 @@ FEATURES = {
     "sources": Feature(bed, rained, ("dem/parts/sources.py", "dem/record/passage.py", "dem/geometry/insertion.py")),
     "outlets": Feature(bed, drained, ("dem/parts/sources.py", "dem/record/passage.py")),
     "clumps": Feature(bed, lambda: bed(clumps=True), ("contact/clumps.py", "dem/shapes/clumps.py")),
-    "periodic": Feature(bed, lambda: bed(walls=False), ("dem/model/period.py",)),
+    "periodic": Feature(bed, lambda: bed(walls=False), ("dem/parts/cell.py", "dem/model/images.py")),
     "shear": Feature(lambda: flow(at_rest=True), flow, ()),
     "servo": Feature(lambda: flow(constant=True), flow, ("contact_map/mass.py", "dem/step/servo.py")),
     "rolling": Feature(bed, lambda: bed(rolling=5e-4, spinning=1e-4), ("dem/step/rolling.py",

@@ -13,9 +13,8 @@ import pctt
 from dem import measures
 from dem.measures import Block, Cylinder, Sample
 from dem.mesh import Mesh
-from dem.model.period import lattice
-from dem.model.world import Shear
 from dem.packing import random_packing
+from dem.parts.cell import Cell
 from dem.scene import Scene
 from pctt import analysis
 from pctt.folder import Folder
@@ -23,13 +22,13 @@ from pctt.folder import Folder
 PERIOD = np.array([1.0, 1.3, 0.9])
 
 
-def cell(period, shear=None, seed=0, count=12):
+def cell(period, shear=(), seed=0, count=12):
     """Spheres within a cell, and contacts of some of them that reach anywhere near it."""
     rng = np.random.default_rng(seed)
     pairs = np.array([[a, b] for a in range(count) for b in range(a + 1, count + 1, 3)])  # the last body is large
     n, vectors = rng.standard_normal((len(pairs), 3)), (len(pairs), 3)
     point = rng.uniform(0.0, PERIOD, vectors)
-    way, drift = lattice(np.where(period, PERIOD, np.inf), shear)
+    way, drift = Cell(np.where(period, PERIOD, np.inf), *shear).lattice
     return Sample(
         comm=MPI.COMM_SELF, count=count, id=np.arange(count), position=rng.uniform(0.0, PERIOD, (count, 3)),
         velocity=rng.standard_normal((count, 6)), mass=rng.uniform(1.0, 2.0, count), shape=np.zeros(count, np.int64),
@@ -68,8 +67,8 @@ def copied(sample, times=3):
 
 
 CELLS = [
-    ((1, 1, 1), None), ((1, 0, 1), None), ((0, 1, 0), None),
-    ((1, 1, 1), Shear(2.0, 2, 0.9, 17.37)), ((1, 1, 0), Shear(-3.0, 1, 1.3, -0.44)),
+    ((1, 1, 1), ()), ((1, 0, 1), ()), ((0, 1, 0), ()),
+    ((1, 1, 1), (2, 2.0, 17.37)), ((1, 1, 0), (1, -3.0, -0.44)),
 ]  # fmt: skip
 BLOCKS = [Block((-0.7, 0.2, -0.3), (0.4, 1.9, 0.5)), Block((0, 0, 0), PERIOD), Block((1.2, -0.9, 0.3), (1.5, 0.4, 2.2))]
 TUBES = [Cylinder((-0.5, 0.1, -0.2), (0.9, 1.5, 0.4), 0.4), Cylinder((0.5, 0.5, -0.6), (0.5, 0.5, 1.2), 0.7)]

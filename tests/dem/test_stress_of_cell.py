@@ -113,10 +113,10 @@ def test_stress_is_off_by_the_drag_of_the_cell_alone():
     sim = packed(sheared=True)
     sim.run(steps=40)
     for _ in range(5):
-        before, kept = of_flow(sim), np.clip(KEPT * sim.world.servo.rate, -2.0, 2.0)
+        before, kept = of_flow(sim), np.clip(KEPT * sim.world.cell.rate, -2.0, 2.0)
         sim.step()
         borne = stress(sim) * sim.period.prod() - of_flow(sim)
-        rate, volume = sim.world.servo.rate, sim.period.prod() / np.prod(1.0 + 0.001 * sim.world.servo.rate)
+        rate, volume = sim.world.cell.rate, sim.period.prod() / np.prod(1.0 + 0.001 * sim.world.cell.rate)
         drag = ((borne + before) / volume - PRESSURE) / (rate - kept)
         fastest = CLOSING * np.sqrt(PRESSURE / 2500.0) / 0.01 + LEADING * 2.0
         np.testing.assert_allclose(drag, PRESSURE / fastest, rtol=0.01)  # spheres of 9.8 to 10 mm
@@ -203,7 +203,7 @@ def test_work_is_stress_times_strain_and_closes_the_balance(sheared):
     lost = 0.0
     for _ in range(8):
         sim.step()
-        rate = sim.world.servo.rate
+        rate = sim.world.cell.rate
         assert np.abs(rate[[0, 2]]).min() > 0.0
         lost += sim.figures["friction_loss [J]"] + sim.figures["impact_loss [J]"]
         assert abs(sim.figures["time_stepping [J]"]) < 1e-9 * sim.figures["kinetic_energy [J]"]
@@ -238,7 +238,7 @@ def test_restart_goes_on_with_the_same_bits(tmp_path):
     for each in (sim, other):
         each.run(steps=4)
     assert np.array_equal(sim.period, other.period)
-    assert np.array_equal(sim.world.servo.asked, other.world.servo.asked)
+    assert np.array_equal(sim.world.cell.stress, other.world.cell.stress)
     assert np.array_equal(sim.positions, other.positions)
     assert np.array_equal(sim.velocities, other.velocities)
 
@@ -296,7 +296,7 @@ def flow(inertial, fraction):
         shear.append(-sim.figures["stress_xz [Pa]"])
         pressure.append(sim.figures["stress_zz [Pa]"])
 
-    sim.run(until=2.0 / sim.world.shear.rate, call=keep)
+    sim.run(until=2.0 / sim.world.cell.shear_rate, call=keep)
     late = slice(len(shear) // 2, None)
     assert abs(np.mean(pressure[late]) / PRESSURE - 1.0) < 0.005
     assert np.std(pressure[late]) < 0.02 * PRESSURE

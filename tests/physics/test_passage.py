@@ -84,7 +84,7 @@ def test_no_grain_comes_into_another_one_and_those_without_room_wait():
     assert sim.source("one").refused == 4  # nothing is due at time zero
     assert sim.figures["refused_one"] == 4
     first = sim._of_grains("size")[1:6, 0]  # in the order of the queue, whatever their size
-    sizes = scene.sources["one"].grains("one", np.arange(5)).size[:, 0]
+    sizes = scene.passages.sources["one"].grains("one", np.arange(5)).size[:, 0]
     np.testing.assert_array_equal(first, sizes)
 
 

@@ -108,7 +108,7 @@ def state(sim):
     local, replicated = sim.world.state()
     arrays = {**local, **replicated}
     arrays |= {f"memory {k}": values for k, values in enumerate(sim.memory.state())}
-    arrays |= {"tallies": np.array([list(vars(tally).values()) for tally in sim.world.tallies.values()])}
+    arrays |= {"tallies": np.array([list(vars(tally).values()) for tally in sim.world.passages.tallies.values()])}
     kept = {name: np.array(values) for name, values in arrays.items()}
     return kept | {"figures": sim.figures}, sim.world.lists
 
