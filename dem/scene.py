@@ -13,9 +13,9 @@ by a `dem.arrays.Rule` takes no memory at all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Union
+from typing import Any, TypeVar, Union
 
 import numpy as np
 from mpi4py import MPI
@@ -28,13 +28,31 @@ from dem.measures import Block, Cylinder
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
 from dem.parts import contact_law
 from dem.parts.contact_law import ContactLaw
+from dem.parts.ends import End
 from dem.parts.joints import Joint, whole_periods
 from dem.parts.loads import Law, Load, On
+from dem.parts.named import Named
 from dem.parts.sources import MOST_IDS, Outlet, Source
-from dem.parts.springs import End, Spring
+from dem.parts.springs import Spring
 from dem.quaternion import across, length
 from dem.shapes import Clump, Shape, clumps, polyhedra
 from dem.shapes.forms import Form
+
+#: The kinds of parts with names, in the order in which they act.
+KINDS: dict[str, type[Named]] = {"load": Load, "spring": Spring, "joint": Joint, "source": Source}
+
+N = TypeVar("N", bound=Named)
+
+
+def no_parts() -> dict[str, dict[str, Any]]:
+    """Parts by kind and name: none yet."""
+    return {kind: {} for kind in KINDS}
+
+
+def kinds_of(base: type[N], named: Mapping[str, dict[str, Any]]) -> list[tuple[str, type[N], dict[str, N]]]:
+    """The kinds derived from a class that have parts in `named`: name, class and the parts by their names."""
+    return [(kind, own, named[kind]) for kind, own in KINDS.items() if named[kind] and issubclass(own, base)]
+
 
 #: A velocity (3,), or a function of points (n, 3) [m] and outward normals (n, 3) that returns (3,) or (n, 3) [m/s].
 SurfaceVelocity = Union[Sequence[float], Callable[[Floats, Floats], ArrayLike]]
@@ -177,11 +195,8 @@ class Scene:
         self.parts: list[Part] = []  #: the grains, as they were added
         self._survey: Survey | None = None
         self.forms: list[Form] = []  #: the distinct shapes of clumps and polyhedra, see `dem.bodies`
-        self.loads: dict[str, Load] = {}  #: by name
-        self.springs: dict[str, Spring] = {}  #: by name
-        self.sources: dict[str, Source] = {}  #: by name
+        self.named = no_parts()  #: loads, springs, joints and sources by kind and name, see `KINDS`
         self.outlets: dict[str, Outlet] = {}  #: by name
-        self.joints: dict[str, Joint] = {}  #: by name
 
     @property
     def deforms(self) -> bool:
@@ -357,9 +372,9 @@ class Scene:
         function of the time [s] and the table of the bodies, see `dem.parts.loads.Load`. They act from `start` to
         `end` [s].
         """
-        if not name or name in self.loads or name in (body.name for body in self.large_bodies):
+        if not name or name in self.named["load"] or name in (body.name for body in self.large_bodies):
             raise ValueError(f"loads need names that no other load and no large body has, got {name!r}")
-        self.loads[name] = Load(on, force, torque, start, end)
+        self.named["load"][name] = Load(on, force, torque, start, end)
 
     def add_spring(
         self,
@@ -379,13 +394,11 @@ class Scene:
         of the world is a place [m]. stiffness [N/m], damping [N s/m], rest `length` [m]: None is the distance at time
         zero; with zero the spring acts in all directions.
         """
-        if not name or name in self.springs:
+        if not name or name in self.named["spring"]:
             raise ValueError(f"springs need distinct names, got {name!r}")
         spring = Spring((one, other), (anchor, other_anchor), stiffness, damping, 0.0 if length is None else length)
-        poses = [self.pose(f"spring {name!r}", end) for end in spring.ends]
-        places = [place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, spring.anchors)]
-        rest = float(np.linalg.norm(places[1] - places[0])) if length is None else length
-        self.springs[name] = replace(spring, length=rest)
+        rest = float(np.linalg.norm(spring.vector(f"spring {name!r}", self)))
+        self.named["spring"][name] = spring if length is not None else replace(spring, length=rest)
 
     def add_joint(
         self,
@@ -411,7 +424,7 @@ class Scene:
         [N m, N]; inf: as much as it takes. `limits` (2,): least and greatest angle [rad] or position [m]. The two
         bodies go through each other, unless they are `touching`.
         """
-        if not name or name in self.joints:
+        if not name or name in self.named["joint"]:
             raise ValueError(f"joints need distinct names, got {name!r}")
         place = checks.vector(f"anchor of {name!r}", anchor)
         z = checks.unit_vector(f"axis of {name!r}", axis)
@@ -428,7 +441,7 @@ class Scene:
                 raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
         low, high = map(float, limits)
         motor = speed, target, float(strength)
-        self.joints[name] = Joint(kind, (one, other), anchors, frames, *motor, low, high, touching)
+        self.named["joint"][name] = Joint((one, other), anchors, kind, frames, *motor, low, high, touching)
 
     def pose(self, what: str, end: End) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) of an end of a spring or joint at time 0; ValueError if there is none."""
@@ -456,6 +469,11 @@ class Scene:
         """Let grains leave whose centres are in a region of `dem.measures`; `outside`: those that are not in it."""
         self._refuse_passage(name)
         self.outlets[name] = Outlet(region, outside)
+
+    @property
+    def sources(self) -> dict[str, Source]:
+        """By name."""
+        return self.named["source"]
 
     def _refuse_passage(self, name: str) -> None:
         if not name or set(name) & set(',"\n') or name in {**self.sources, **self.outlets}:
@@ -717,10 +735,6 @@ def _refuse_in_cell(scene: Scene, period: Floats, radius: float) -> None:
         if scene.sources or scene.outlets:
             name = next(iter({**scene.sources, **scene.outlets}))
             raise ValueError(f"{name!r}: a {cell} has no sources and outlets")
-        if scene.joints:
-            raise ValueError(f"joint {next(iter(scene.joints))!r}: a {cell} has no joints")
-    if scene.springs:
-        raise ValueError(f"spring {next(iter(scene.springs))!r}: springs have no images, so periods allow none")
     for body in scene.large_bodies:
         for shape in body.shapes:
             kind, center, turn, size = shapes.placed(shape)

@@ -15,11 +15,8 @@ from dem.arrays import Floats, Ints, Keys
 from dem.bodies import Bodies
 from dem.motion import Dynamic, Pose, checked_pose
 from dem.parts.contact_law import ContactLaw
-from dem.parts.joints import Joint
-from dem.parts.loads import Load
 from dem.parts.sources import Outlet, Source, Tally, as_array
-from dem.parts.springs import Spring
-from dem.scene import LargeBody
+from dem.scene import LargeBody, no_parts
 from dem.shapes.forms import Form
 from dem.together import together
 
@@ -61,7 +58,7 @@ class Servo:
 
 #: The fields of a world that a step changes; what these refer to is replaced, and never changed in place.
 STATE = (
-    "grains", "large", "slabs", "only_spheres", "lists", "expected", "period", "shear", "servo", "tallies", "time",
+    "grains", "large", "slabs", "only_spheres", "lists", "memory", "period", "shear", "servo", "tallies", "time",
     "step", "spare",
 )  # fmt: skip
 
@@ -82,13 +79,11 @@ class World:
     materials: tuple[str, ...]  #: their names; the column `material` of a table of bodies is an index into them
     grains: Bodies  #: the slab of this rank; replace it by `set_grains` only
     large: Bodies  #: one row per large body
-    loads: dict[str, Load] = field(default_factory=dict)  #: by name; `dem.model.changes.change` alone changes parts
-    springs: dict[str, Spring] = field(default_factory=dict)  #: by name
-    joints: dict[str, Joint] = field(default_factory=dict)  #: by name
-    #: pairs of ids, the lower + 1j the upper, of bodies that joints join and that do not touch each other
+    #: parts by kind and name, see `dem.scene.KINDS`; `dem.model.changes.change` alone changes them
+    named: dict[str, dict[str, Any]] = field(default_factory=no_parts)
+    #: pairs of ids, the lower + 1j the upper, of bodies at the ends of a part that do not touch each other
     apart: Keys = field(default_factory=lambda: np.zeros(0, complex))
     period: Floats | None = None  #: (3,) lengths of the cell that repeats itself, inf: none; None: along no axis [m]
-    sources: dict[str, Source] = field(default_factory=dict)  #: by name
     outlets: dict[str, Outlet] = field(default_factory=dict)  #: by name
     tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets, by name
     forms: tuple[Form, ...] = ()  #: shapes of grains, by their numbers
@@ -102,13 +97,13 @@ class World:
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
 
-    #: Kinds and names of what a run has changed by `dem.model.changes.change`: large bodies, loads, springs and others.
+    #: Kinds and names of the parts and large bodies that a run has changed by `dem.model.changes.change`.
     changed: set[tuple[str, str]] = field(init=False, default_factory=set)
 
     lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
 
-    #: Velocities (springs, 2, 6) that the ends of springs were to have after the last step without contacts and drives.
-    expected: Floats | None = field(init=False, default=None)
+    #: What parts of a kind, by its name, hand from the last step to the next: (parts, `dem.parts.named.Force.MEMORY`).
+    memory: dict[str, Floats] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
@@ -130,8 +125,7 @@ class World:
         ones."""
         replicated = {f"large_{name}": column for name, column in self.large.columns().items()}
         replicated.update(slabs=self.slabs, time=np.array(self.time), step=np.array(self.step))
-        if self.expected is not None:
-            replicated["expected"] = self.expected
+        replicated.update({f"memory_{kind}": array for kind, array in self.memory.items()})
         replicated["spare"] = np.array(self.spare)
         if self.tallies:
             replicated["tallies"] = as_array(self.tallies)
@@ -149,6 +143,11 @@ class World:
         self.comm.Allgather(np.array([len(grains), (grains.shape != bodies.SPHERE).any()], np.int64), everyone[1:])
         self.slabs = np.cumsum(everyone[:, 0])
         self.only_spheres = not everyone[:, 1].any()
+
+    @property
+    def sources(self) -> dict[str, Source]:
+        """By name."""
+        return self.named["source"]
 
     @property
     def ids(self) -> int:

@@ -15,7 +15,7 @@ they are solved once more with it (`refound`).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -25,8 +25,8 @@ from dem import checks, quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.free_motion import free_spin, unequal
 from dem.motion import DROOP
-from dem.parts.named import Named
-from dem.parts.springs import End, Ends
+from dem.parts.ends import Ends, Tie
+from dem.parts.named import Pressing
 
 KINDS = ("hinge", "slider", "ball", "fixed")
 #: Which of three translations and three turns, along the axes of the joint, a kind holds; z is the axis.
@@ -44,12 +44,10 @@ HELD, MOTOR, LOWER, UPPER = range(4)  #: kinds of rows: what a joint holds, its 
 
 
 @dataclass(frozen=True)
-class Joint(Named):
+class Joint(Tie):
     """A joint. The anchors and frames are in the frames of its bodies; of the world they are places."""
 
     kind: str
-    ends: tuple[End, End]
-    anchors: Sequence[Sequence[float]]  #: (2, 3) [m]
     frames: Sequence[Sequence[float]]  #: (2, 4) quaternions, of which the z axis is that of the joint
     speed: float | None = None  #: that a motor keeps [rad/s] or [m/s]
     target: float | None = None  #: angle [rad] or position [m] to which a motor goes, in one step as far as it can
@@ -63,10 +61,7 @@ class Joint(Named):
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ValueError(f"kind of a joint {self.kind!r}: allowed are {', '.join(KINDS)}")
-        ends = tuple(end if end is None or isinstance(end, str) else int(end) for end in self.ends)
-        if ends[0] == ends[1]:
-            raise ValueError(f"both ends of a joint are at {ends[0]}: allowed are two bodies, or a body and the world")
-        object.__setattr__(self, "ends", ends)
+        super().__post_init__()
         if self.speed is not None and self.target is not None:
             raise ValueError("the motor of a joint: allowed is a speed or a target, not both")
         for name in ("speed", "target"):
@@ -77,6 +72,27 @@ class Joint(Named):
             raise ValueError(f"limits of a joint: the lower one, {self.low:g}, is above the upper one, {self.high:g}")
         if self.kind in ("ball", "fixed") and (self.driven or np.isfinite([self.low, self.high]).any()):
             raise ValueError(f"a {self.kind} joint has no motor and no limits: allowed are those of hinges and sliders")
+
+    def refuse(self, name: str, world: Any) -> None:
+        super().refuse(name, world)
+        if world.shear is not None or world.servo is not None:
+            cell = "sheared cell" if world.servo is None else "cell of given stress"
+            raise ValueError(f"joint {name!r}: a {cell} has no joints")
+
+    @classmethod
+    def pressing(cls, members: Mapping[str, Any], scene: Any, body: Callable[[Any], tuple[float, ...]]) -> Pressing:
+        """The greatest force of motors, and the lighter bodies of joints with their speeds."""
+        greatest, impacts = 0.0, []
+        for joint in members.values():
+            if not joint.driven:
+                continue
+            mass, _, radius = min(body(end) for end in joint.ends)
+            lever = radius if joint.kind == "hinge" else 1.0
+            if np.isfinite(joint.strength):
+                greatest = max(greatest, joint.strength / lever)
+            if joint.speed is not None and np.isfinite(mass):
+                impacts.append((mass, abs(joint.speed) * lever))
+        return Pressing(greatest, impacts=tuple(impacts))
 
     @property
     def driven(self) -> bool:

@@ -47,10 +47,10 @@ class Step:
 
     def spring_force(self, name: str) -> Floats:
         """Force (3,) of a spring on its second end, averaged over the step [N]; the first has the opposite one."""
-        names = list(self.world.springs)
-        if name not in names or self.system.applied is None:
+        names = list(self.world.named["spring"])
+        if name not in names:
             raise KeyError(f"no spring {name!r}; there are: {', '.join(names) or 'none'}")
-        force: Floats = self.system.applied.springs[names.index(name)] / self.system.dt
+        force: Floats = self.world.memory["spring"][names.index(name), 12:] / self.system.dt
         return force
 
     @cached_property
@@ -156,7 +156,7 @@ def advance(
     if world.servo is not None:
         world.grains.position = world.grains.position + dt * world.servo.rate * start
     if free.applied is not None:
-        world.expected = free.applied.expected
+        world.memory = free.applied.memory
     if world.shear is not None:
         world.shear = world.shear.after(dt)
     resize(world, dt)

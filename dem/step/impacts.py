@@ -58,7 +58,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     grains, old = near.grains + near.ghosts, table.velocity
     ball = table.shape == SPHERE
     ball[grains:] = False
-    if world.joints:
+    if world.named["joint"]:
         ball &= ~np.isin(table.id, jointed(world)[0])
     if pairs.restitution.any():
         old = old.copy()

@@ -85,7 +85,7 @@ class ContactSystem:
         drives: of the large bodies, the same on all ranks
         at_once: how many contacts of this rank bounce with all others of the step, and not in their order
         joints: the rows of joints, a `dem.parts.joints.Coupling`; None if there are none
-        applied: what loads and springs give, a `dem.unconstrained.applied.Applied`; None if there are none
+        applied: what parts give, a `dem.unconstrained.applied.Applied`; None if none do
     """
 
     def __init__(
@@ -324,8 +324,8 @@ class ContactSystem:
         return self.problem_map.shared(impulse if moment is None else np.concatenate([impulse, moment]))
 
     def drive_impulse(self, large: Floats) -> Floats:
-        """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities
-        `large` (large, 6) after the step."""
+        """Impulses and angular impulses (large, 6) of the drives of large bodies, and of parts on them, that have the
+        velocities `large` (large, 6) after the step."""
         line, slip = self.drives.line, self.free_large - large
         return self.drives.impulse + (self.drives.grip * np.einsum("bi,bi->b", line, slip))[:, None] * line
 

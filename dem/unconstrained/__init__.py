@@ -1,7 +1,7 @@
-"""The motion of the bodies over a step without contacts: gravity, spin, loads, springs, drives, prescribed motions.
+"""The motion of the bodies over a step without contacts: gravity, spin, forces of parts, drives, prescribed motions.
 
 It is found once, at the start of a step, and handed on: the search for contacts, the contact problem, the advance and
-the record take what they need from it. No other part of a step asks motions, loads or springs.
+the record take what they need from it. Nothing else of a step asks motions and forces.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dem.model.world import World
 from dem.motion import Pose
 from dem.parts import joints
 from dem.together import together
-from dem.unconstrained.applied import Applied, applied_impulses, ends_of, row_of
+from dem.unconstrained.applied import Applied, applied_impulses, ends_of, rows_of
 from dem.unconstrained.drives import Drives, drives_of, given_velocities
 
 
@@ -34,7 +34,7 @@ class UnconstrainedMotion:
     #: (large, 6) mean velocities that motions give, see `dem.unconstrained.drives.given_velocities` [m/s, rad/s]
     given: Floats
     prescribed: Floats  #: (large, 6) of prescribed motions the same; other bodies keep theirs
-    applied: Applied | None  #: what loads and springs give; None without any
+    applied: Applied | None  #: what parts give; None without any
     drives: Drives  #: of the large bodies, the same on all ranks
     grains: Floats  #: (grains, 6) velocities of this rank's grains [m/s, rad/s]
     #: (owned, 6) mass-scaled momenta that contacts are expected to give, about which bodies that are no spheres and
@@ -48,8 +48,8 @@ class UnconstrainedMotion:
 
 
 def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
-    """The motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a load fails, or
-    if dt is too large for the springs."""
+    """The motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a part
+    fails."""
     positive("time step", dt)
     poses = world.poses(world.time + dt)
     given, moves = given_velocities(world, poses, dt), bodies.is_dynamic(world.large)
@@ -112,28 +112,25 @@ def free_velocities(
 def jointed(world: World) -> tuple[Ints, Ints]:
     """The ids of the grains of joints, in order, and the rows (joints, 2) of the ends of joints among these, the large
     bodies and the world."""
-    ends = [end for joint in world.joints.values() for end in joint.ends]
-    ids = np.unique([end for end in ends if isinstance(end, int)]).astype(np.int64)
-    return ids, np.array([row_of(world, ids, end) for end in ends]).reshape(-1, 2)
+    return rows_of(world, world.named["joint"].values())
 
 
 def joint_coupling(world: World, free: UnconstrainedMotion, push: Floats | None = None) -> joints.Coupling | None:
     """The joints in the step; None without any. `push` (owned, 6): the mass-scaled momenta that contacts are expected
     to give the bodies whose rows this rank owns. Collective."""
-    if not world.joints:
+    if not world.named["joint"]:
         return None
-    ids, row = jointed(world)
     grains, large = np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity)
     if free.applied is not None:
         grains, large = free.applied.grains, free.applied.large
-    table = ends_of(world, ids, grains, large, free.given, free.dt)
+    table = ends_of(world, world.named["joint"].values(), grains, large, free.given, free.dt)
     gathered = np.zeros_like(table.free)
     if push is not None:
         id = np.concatenate([world.grains.id, world.large.id])[: len(push)]
         here, slot = slots(world, id)
         gathered[slot] = push[here]
         world.comm.Allreduce(MPI.IN_PLACE, gathered)
-    given = list(world.joints.values()), row, table, free.dt, world.period, gathered
+    given = list(world.named["joint"].values()), table.row, table, free.dt, world.period, gathered
     found = joints.coupling(*given) if world.comm.rank == 0 else None
     return world.comm.bcast(found)  # processors may round in other ways
 
@@ -161,4 +158,4 @@ def joints_now(world: World) -> tuple[joints.Geometry, Floats]:
     tools = np.concatenate([large.position, large.quaternion, large.velocity], axis=1)
     rest = np.concatenate([np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], np.zeros((1, 6))], axis=1)
     position, turn, velocity = np.split(np.concatenate([gathered, tools, rest]), [3, 7], axis=1)
-    return joints.geometry(list(world.joints.values()), row, position, turn, world.period), velocity[row]
+    return joints.geometry(list(world.named["joint"].values()), row, position, turn, world.period), velocity[row]

@@ -51,7 +51,7 @@ class Dump:
     ):  # fmt: skip
         self._settings, self._experiment, self._world, self._place = settings, experiment, world, place
         self._hard_left, self._folder = hard, folder
-        self._none = unwritten(world.pairs, world.joints, world.servo is not None)
+        self._none = unwritten(world.pairs, world.named["joint"], world.servo is not None)
         if folder and self._none:
             raise OptionError(f"-dump_problem: {self._none}")
 

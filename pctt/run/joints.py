@@ -18,10 +18,10 @@ class JointNow:
     __slots__ = ("_number", "_sim", "name")
 
     def __init__(self, sim: Any, name: str):
-        if name not in sim.world.joints:
-            raise ValueError(f"no joint {name!r}; there are: {', '.join(sim.world.joints) or 'none'}")
+        if name not in sim.world.named["joint"]:
+            raise ValueError(f"no joint {name!r}; there are: {', '.join(sim.world.named['joint']) or 'none'}")
         self._sim, self.name = sim, name
-        self._number = list(sim.world.joints).index(name)
+        self._number = list(sim.world.named["joint"]).index(name)
 
     @property
     def _now(self) -> tuple[Joint, Geometry, Floats]:
@@ -29,7 +29,7 @@ class JointNow:
         meet(self._sim.comm, f"joint {self.name}")
         found, velocity = joints_now(self._sim.world)
         relative = np.einsum("wsx,sx->w", found.rows[self._number], velocity[self._number])
-        return self._sim.world.joints[self.name], found, relative
+        return self._sim.world.named["joint"][self.name], found, relative
 
     @property
     def force(self) -> Floats:
@@ -44,7 +44,7 @@ class JointNow:
     @property
     def drive(self) -> float:
         """Torque [N m] or force [N] of the motor and the limits along the axis, its mean over the last step."""
-        joint = self._sim.world.joints[self.name]
+        joint = self._sim.world.named["joint"][self.name]
         return 0.0 if all(HOLDS[joint.kind]) else float(self._impulses[joint.way] / self._sim.settings.dt)
 
     @property
@@ -67,7 +67,7 @@ class JointNow:
     def motor(self) -> Joint:
         """The ``speed``, ``target``, ``strength``, ``low`` and ``high`` of the motor and the limits, to read; not
         collective."""
-        joint: Joint = self._sim.world.joints[self.name]
+        joint: Joint = self._sim.world.named["joint"][self.name]
         return joint
 
     def _coordinate(self, kind: str) -> float:
