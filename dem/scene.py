@@ -29,7 +29,7 @@ from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, ref
 from dem.parts import contact_law
 from dem.parts.contact_law import ContactLaw
 from dem.parts.ends import End
-from dem.parts.joints import Joint, whole_periods
+from dem.parts.joints import Joint
 from dem.parts.loads import Law, Load, On
 from dem.parts.named import Named
 from dem.parts.sources import MOST_IDS, Outlet, Source
@@ -415,8 +415,7 @@ class Scene:
         limits: Sequence[float] = (-np.inf, np.inf),
         touching: bool = False,
     ) -> None:
-        """Join two bodies, or a body and the world (None), by a "hinge", "slider", "ball" or "fixed" joint, see
-        `dem.parts.joints`.
+        """Join two bodies, or a body and the world (None), by a joint of a `kind` of `dem.parts.joints.KINDS`.
 
         A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,) are in the
         world at time zero, where angle and position are zero; they are those of `other` relative to `one`. A motor
@@ -426,22 +425,10 @@ class Scene:
         """
         if not name or name in self.named["joint"]:
             raise ValueError(f"joints need distinct names, got {name!r}")
-        place = checks.vector(f"anchor of {name!r}", anchor)
-        z = checks.unit_vector(f"axis of {name!r}", axis)
-        x = across(np.array(z)[None])[0]
-        upright = quaternion.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
-        anchors, frames = [], []
-        for position, turn in (self.pose(f"joint {name!r}", end) for end in (one, other)):
-            back, arm = quaternion.conjugate(turn), place - position
-            arm = arm - whole_periods(arm, self.period)
-            anchors.append(tuple(quaternion.rotate(back, arm).tolist()))
-            frames.append(tuple(quaternion.multiply(back, upright).tolist()))
-        for body in self.large_bodies:
-            if body.name in (one, other) and isinstance(body.motion, Driven):
-                raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
         low, high = map(float, limits)
-        motor = speed, target, float(strength)
-        self.named["joint"][name] = Joint((one, other), anchors, kind, frames, *motor, low, high, touching)
+        given = {"kind": kind, "speed": speed, "target": target, "strength": float(strength), "low": low, "high": high}
+        joint = Joint.between(name, (one, other), self, anchor, axis, **given, touching=touching)
+        self.named["joint"][name] = joint
 
     def pose(self, what: str, end: End) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) of an end of a spring or joint at time 0; ValueError if there is none."""

@@ -1,4 +1,4 @@
-"""Parts between two bodies, or between a body and the world."""
+"""Parts between two bodies, or between a body and the world, and those of them that hold these bodies."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 from dem import checks, quaternion
 from dem.arrays import Floats, Ints
 from dem.parts.named import Named
+
+HELD, MOTOR, LOWER, UPPER = range(4)  #: kinds of conditions: what is held, a motor, limits
 
 #: A large body by its name, a grain by its id, or the world.
 End = Union[str, int, None]
@@ -44,6 +46,41 @@ class Tie(Named):
         one, two = (place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, self.anchors))
         between: Floats = two - one
         return between
+
+
+class Geometry(NamedTuple):
+    """n constraints as they are."""
+
+    rows: Floats  #: (n, 6, 2, 6) from velocities of the ends to relative ones along, and about, three axes
+    error: Floats  #: (n, 6) coordinates: translations [m] and turns [rad] of the second end relative to the first
+    axes: Floats  #: (n, 3, 3) rows x, y, z in the world
+
+
+class Condition(NamedTuple):
+    """What a constraint asks of one of its six relative velocities."""
+
+    way: int
+    kind: int  #: HELD, MOTOR, LOWER or UPPER
+    target: float  #: [m/s, rad/s]
+    bound: float = np.inf  #: greatest impulse of a motor
+
+
+class Constraint(Tie):
+    """A part whose impulses follow from what it asks of relative velocities of its bodies, together with those of all
+    contacts; see `dem.unconstrained.constraints`."""
+
+    @classmethod
+    def geometry(
+        cls, members: Sequence[Any], row: Ints, position: Floats, orientation: Floats, period: Floats | None
+    ) -> Geometry:
+        """Of n parts of the kind between bodies in the rows `row` (n, 2), with positions (bodies, 3) [m] and
+        quaternions (bodies, 4). With a `period` (3,) of the cell [m] the second ends are those images whose anchors are
+        nearest to the first ones."""
+        raise NotImplementedError
+
+    def conditions(self, error: Floats, dt: float) -> list[Condition]:
+        """What it asks in a step of dt [s] that begins with these coordinates (6,)."""
+        raise NotImplementedError
 
 
 class Ends(NamedTuple):

@@ -25,7 +25,7 @@ from dem.start import stiffness
 from dem.step import Step
 from dem.step.servo import cell_stress
 from dem.together import SceneError, digest, together
-from dem.unconstrained import slots
+from dem.unconstrained.constraints import slots
 
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:
@@ -196,14 +196,14 @@ def energy_balance(step: Step) -> dict[str, float]:
         applied=applied, belts=belts, flow=flow,
     )  # fmt: skip
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
-    joints, joints_at_end = _joint_works(step, before[0].velocity, mean)
+    held_by, held_at_end = _constraint_works(step, before[0].velocity, mean)
     driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + (whole["applied"] + whole["flow"])
-    driving = driving + whole["belts"] + (holding + joints)
+    driving = driving + whole["belts"] + (holding + held_by)
     work = driving - np.vdot(step.impulse_on_large[~moves], mean[~moves])
     rise, fallen = whole["kinetic"] - whole["kinetic_before"], whole["potential_before"] - whole["potential"]
     held, bent = whole["elastic_at_end"] - whole["elastic"], whole["strained_at_end"] - whole["strained"]
     pulled, released = 2.0 * max(whole["cohesion"], 0.0), max(-held, 0.0) + max(-bent, 0.0)
-    pulled += max(joints_at_end - joints, 0.0)  # with the velocity of the end, for bodies that were at rest
+    pulled += max(held_at_end - held_by, 0.0)  # with the velocity of the end, for bodies that were at rest
     there = whole["kinetic_before"] + whole["still"] + whole["carried"]
     stored = whole["elastic"] + whole["strained"]
     created = rise - fallen - work - released - pulled > CREATED * (there + stored + abs(work))
@@ -310,14 +310,14 @@ def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
     return work
 
 
-def _joint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, float]:
-    """The work [J] of joints and their motors on the bodies that forces move, on the mean velocities of the step and on
+def _constraint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, float]:
+    """The work [J] of constraints and motors on the bodies that forces move, on the mean velocities of the step and on
     those of its end: velocities (grains, 6) of this rank's grains before the step, and means (large, 6) of those before
     and after; collective."""
     system, world = step.system, step.world
-    if system.joints is None:
+    if system.coupling is None:
         return 0.0, 0.0
-    push = np.einsum("k,knx->nx", step.joint_impulses, system.joints.rows)
+    push = np.einsum("k,knx->nx", step.constraint_impulses, system.coupling.rows)
     here, slot = slots(world, world.grains.id)
     velocity = world.grains.velocity[here]
     works = np.array([0.5 * np.vdot(push[slot], before[here] + velocity), np.vdot(push[slot], velocity)])

@@ -47,7 +47,7 @@ def _body(scene: Scene, end: End) -> tuple[float, float, float]:
 
 def _tools(scene: Scene, pushes: Sequence[tuple[str, Floats, float]]) -> Pressing:
     """The greatest force that a large body lays on a grain, by its weight, pushes on it and its drive, and how fast
-    those come that meet a few grains alone, or none. Beneath a wide one a bed gives way, the more so if it is a servo."""
+    those come that meet a few grains alone, or none. Beneath a wide one a bed gives way, the more if it is a servo."""
     greatest, impacts = 0.0, []
     radius = float(bodies.bounding_radius(scene.expected()).min())
     count, falls = np.inf if scene.sources else float(scene.count), math.hypot(*scene.gravity)

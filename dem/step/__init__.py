@@ -54,9 +54,9 @@ class Step:
         return force
 
     @cached_property
-    def joint_impulses(self) -> Floats:
-        """`ContactSystem.joint_impulses` of this step; collective at its first use."""
-        return self.system.joint_impulses(self.impulse, self.moment)
+    def constraint_impulses(self) -> Floats:
+        """`ContactSystem.constraint_impulses` of this step; collective at its first use."""
+        return self.system.constraint_impulses(self.impulse, self.moment)
 
     def position(self, name: str) -> Floats:
         """Position (3,) of a large body [m]."""
