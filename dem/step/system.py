@@ -165,7 +165,7 @@ class ContactSystem:
         return replace(motion, push=push, coupling=coupling), change
 
     def _free(self, world: World, change: Floats | None) -> tuple[Floats, Floats, Floats]:
-        """Velocities (rows, 6) without contacts of the bodies of `near`, with constraints; those of contacts (nc, 3), and
+        """Velocities (rows, 6) without contacts of the bodies of `near`, with constraints, of contacts (nc, 3), and
         their rounding (nc,); collective. Sets `middle` and the inverse mass of constrained bodies."""
         given, row, owned = self.contact_map.given, self.contact_map.body, world.owned
         free, self.middle = free_velocities(world, self.near, self.motion, change)
