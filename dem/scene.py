@@ -408,7 +408,7 @@ class Scene:
         *,
         kind: str = "hinge",
         anchor: Sequence[float],
-        axis: Sequence[float] = (0.0, 0.0, 1.0),
+        axis: ArrayLike = (0.0, 0.0, 1.0),
         speed: float | None = None,
         target: float | None = None,
         strength: float = np.inf,
@@ -417,8 +417,8 @@ class Scene:
     ) -> None:
         """Join two bodies, or a body and the world (None), by a joint of a `kind` of `dem.parts.joints.KINDS`.
 
-        A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,) are in the
-        world at time zero, where angle and position are zero; they are those of `other` relative to `one`. A motor
+        A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,), or the axes
+        that the kind has, are in the world at time zero, where angle and position are zero; they are those of `other` relative to `one`. A motor
         keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a torque or force of at most `strength`
         [N m, N]; inf: as much as it takes. `limits` (2,): least and greatest angle [rad] or position [m]. The two
         bodies go through each other, unless they are `touching`.
