@@ -1,4 +1,4 @@
-"""Joints between two bodies, or between a body and the world: hinges, sliders, balls and fixed ones, with motors.
+"""Joints between two bodies, or between a body and the world, with motors: hinges, sliders, universal joints and others.
 
 A kind of joint is a line of `KINDS`. `dem.unconstrained.constraints` finds their impulses.
 """
@@ -38,6 +38,17 @@ def turned_about_z(one: Floats, other: Floats, relative: Floats) -> tuple[Floats
     return one, np.stack([-z[:, 1], z[:, 0], 2.0 * np.arctan2(relative[:, 3], relative[:, 0])], axis=1)
 
 
+def turned_about_pins(one: Floats, other: Floats, relative: Floats) -> tuple[Floats, Floats]:
+    """As `turned`, with two pins, the z axis of the first body and the x axis of the second: the frame of the cross of
+    both, and the Cardan angles, of the cross about the first pin, between the pins, and about the second pin."""
+    turn = quaternion.matrix(relative)
+    angle = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
+    about = np.stack([np.cos(0.5 * angle), 0.0 * angle, 0.0 * angle, np.sin(0.5 * angle)], axis=1)
+    between = -np.arcsin(np.clip(turn[:, 2, 0], -1.0, 1.0))
+    angles = np.stack([np.arctan2(turn[:, 2, 1], turn[:, 2, 2]), between, angle], axis=1)
+    return quaternion.multiply(one, about), angles
+
+
 class Kind(NamedTuple):
     """A kind of joint."""
 
@@ -45,6 +56,7 @@ class Kind(NamedTuple):
     way: int = 5  #: the number of its free coordinate among these, that of motors and limits
     motor: bool = False  #: whether it may have them
     turned: Callable[[Floats, Floats, Floats], tuple[Floats, Floats]] = turned
+    axes: int = 1  #: that a user gives; of two the second one is the x axis
 
 
 KINDS = {
@@ -52,6 +64,7 @@ KINDS = {
     "slider": Kind((True, True, False, True, True, True), way=2, motor=True),
     "ball": Kind((True, True, True, False, False, False)),
     "fixed": Kind((True,) * 6),
+    "universal": Kind((True, True, True, False, True, False), turned=turned_about_pins, axes=2),
 }
 
 
@@ -110,10 +123,13 @@ class Joint(Constraint):
     def between(
         cls, name: str, ends: tuple[End, End], scene: Any, anchor: Sequence[float], axis: ArrayLike, **given: Any
     ) -> Joint:
-        """The joint with the anchor [m] and axis (3,) of the world at time zero, where all its coordinates are zero."""
-        place = checks.vector(f"anchor of {name!r}", anchor)
-        z = checks.unit_vector(f"axis of {name!r}", axis)
-        x = quaternion.across(np.array(z)[None])[0]
+        """The joint with the anchor [m] and axis (3,), or axes (2, 3), of the world at time zero, where all its
+        coordinates are zero."""
+        place, pins = checks.vector(f"anchor of {name!r}", anchor), axis if np.ndim(axis) > 1 else [axis]
+        z, *more = (np.array(checks.unit_vector(f"axis of {name!r}", pin)) for pin in pins)
+        x = more[0] if more else quaternion.across(z[None])[0]
+        if abs(x @ z) > 1e-9:
+            raise ValueError(f"axes of {name!r}: allowed are perpendicular ones, got {np.asarray(axis).tolist()}")
         upright = quaternion.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
         anchors: list[Any] = []
         frames: list[Any] = []
@@ -124,7 +140,10 @@ class Joint(Constraint):
         for body in scene.large_bodies:
             if body.name in ends and isinstance(body.motion, Driven):
                 raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
-        return cls(ends, anchors, frames=frames, **given)
+        joint = cls(ends, anchors, frames=frames, **given)
+        if (count := KINDS[joint.kind].axes) != 1 + len(more):
+            raise ValueError(f"axis of {name!r}: a {joint.kind} joint has {count}, got {1 + len(more)}")
+        return joint
 
     @property
     def driven(self) -> bool:

@@ -51,12 +51,17 @@ class JointNow:
     @property
     def angle(self) -> float:
         """Angle of a hinge, between -pi and pi [rad]."""
-        return self._coordinate("hinge")
+        return float(self._free("hinge")[0])
+
+    @property
+    def angles(self) -> Floats:
+        """Angles (2,) of a universal joint about the axes of the first and of the second body [rad]."""
+        return self._free("universal")[::-1]
 
     @property
     def position(self) -> float:
         """Way of a slider [m]."""
-        return self._coordinate("slider")
+        return float(self._free("slider")[0])
 
     @property
     def speed(self) -> float:
@@ -71,11 +76,13 @@ class JointNow:
         joint: Joint = self._sim.world.named["joint"][self.name]
         return joint
 
-    def _coordinate(self, kind: str) -> float:
+    def _free(self, kind: str) -> Floats:
+        """The free coordinates of a joint of this kind."""
         joint, found, _ = self._now
         if joint.kind != kind:
             raise ValueError(f"joint {self.name!r} is a {joint.kind}, and no {kind}")
-        return float(found.error[self._number, joint.way])
+        free: Floats = found.error[self._number, np.logical_not(KINDS[kind].holds)]
+        return free
 
     @property
     def _impulses(self) -> Floats:
