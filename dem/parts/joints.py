@@ -1,4 +1,4 @@
-"""Joints between two bodies, or between a body and the world, with motors: hinges, sliders, universal joints and others.
+"""Joints between two bodies, or between a body and the world, with motors: hinges, sliders, balls and others.
 
 A kind of joint is a line of `KINDS`. `dem.unconstrained.constraints` finds their impulses.
 """
@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from dem import checks, quaternion
-from dem.arrays import ArrayLike, Floats, Ints
+from dem.arrays import Floats, Ints
 from dem.motion import Driven
 from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Condition, Constraint, End, Geometry
 from dem.parts.named import Pressing
@@ -121,7 +121,7 @@ class Joint(Constraint):
 
     @classmethod
     def between(
-        cls, name: str, ends: tuple[End, End], scene: Any, anchor: Sequence[float], axis: ArrayLike, **given: Any
+        cls, name: str, ends: tuple[End, End], scene: Any, anchor: Sequence[float], axis: Any, **given: Any
     ) -> Joint:
         """The joint with the anchor [m] and axis (3,), or axes (2, 3), of the world at time zero, where all its
         coordinates are zero."""
@@ -142,7 +142,7 @@ class Joint(Constraint):
                 raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
         joint = cls(ends, anchors, frames=frames, **given)
         if (count := KINDS[joint.kind].axes) != 1 + len(more):
-            raise ValueError(f"axis of {name!r}: a {joint.kind} joint has {count}, got {1 + len(more)}")
+            raise ValueError(f"axes of {name!r}: got {1 + len(more)}, allowed are {count} of a {joint.kind} joint")
         return joint
 
     @property

@@ -30,6 +30,8 @@ from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Constraint, Ends, Geometry
 from dem.scene import kinds_of
 from dem.unconstrained.applied import Applied, ends_of, rows_of
 
+Kinds = Sequence[tuple[type[Constraint], Sequence[Constraint]]]
+
 ROUNDS = 8  #: of the iteration for what is not linear in the velocities, at most
 FAR = 0.5  #: radians in a step above which it does not converge, and the step takes constraints as linear
 
@@ -68,10 +70,7 @@ class Coupling:
         return bool(((self.kind > MOTOR) | np.isfinite(self.bound)).any())
 
 
-def _geometry(
-    parts: Sequence[tuple[type[Constraint], Sequence[Constraint]]], row: Ints, position: Floats, turn: Floats,
-    period: Floats | None,
-) -> Geometry:  # fmt: skip
+def _geometry(parts: Kinds, row: Ints, position: Floats, turn: Floats, period: Floats | None) -> Geometry:
     """Of the constraints of all kinds, see `Constraint.geometry`."""
     ends = np.cumsum([0, *(len(members) for _, members in parts)])
     rows = [row[first:end] for first, end in zip(ends, ends[1:])]
@@ -79,10 +78,7 @@ def _geometry(
     return Geometry(*(np.concatenate(each) for each in zip(*found)))
 
 
-def coupling(
-    parts: Sequence[tuple[type[Constraint], Sequence[Constraint]]], ends: Ends, dt: float, period: Floats | None,
-    push: Floats,
-) -> Coupling:  # fmt: skip
+def coupling(parts: Kinds, ends: Ends, dt: float, period: Floats | None, push: Floats) -> Coupling:
     """Of constraints, by kind, between these ends in a step of dt [s], with the period of the cell, where contacts are
     expected to give the bodies the mass-scaled momenta `push` (n, 6).
 
@@ -212,7 +208,7 @@ def constrained(world: World) -> tuple[Ints, Ints]:
     return rows_of(world, [part for _, members in _parts(world) for part in members])
 
 
-def _parts(world: World) -> list[tuple[type[Constraint], list[Constraint]]]:
+def _parts(world: World) -> Kinds:
     return [(kind, [*members.values()]) for _, kind, members in kinds_of(Constraint, world.named)]
 
 

@@ -606,8 +606,8 @@ def test_a_universal_joint_leaves_the_turns_about_its_axes(spin, angles):
 
 
 @pytest.mark.parametrize(("kind", "axis", "words"), [
-    ("universal", (0, 0, 1), "axis of 'j': a universal joint has 2, got 1"),
-    ("hinge", [(0, 0, 1), (1, 0, 0)], "axis of 'j': a hinge joint has 1, got 2"),
+    ("universal", (0, 0, 1), "axes of 'j': got 1, allowed are 2 of a universal joint"),
+    ("hinge", [(0, 0, 1), (1, 0, 0)], "axes of 'j': got 2, allowed are 1 of a hinge joint"),
     ("universal", [(0, 0, 1), (1, 0, 1)], "axes of 'j': allowed are perpendicular ones"),
     ("universal", [(0, 0, 1), (0, 0, 0)], "axis of 'j' is the zero vector"),
     ("cardan", (0, 0, 1), "kind of a joint 'cardan': allowed are hinge, .*, universal"),
