@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Union
 
 import numpy as np
 
-from dem import checks, quaternion
+from dem import checks
 from dem.arrays import Floats, Ints
 from dem.parts.named import Named
 
@@ -39,13 +39,6 @@ class Tie(Named):
         if world.outlets and any(isinstance(end, int) for end in self.ends):
             kind = type(self).__name__.lower()
             raise ValueError(f"{kind} {name!r} holds a grain: with outlets {kind}s may hold large bodies alone")
-
-    def vector(self, what: str, scene: Any) -> Floats:
-        """The vector (3,) from the first anchor to the second in a scene at time zero [m]."""
-        poses = [scene.pose(what, end) for end in self.ends]
-        one, two = (place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, self.anchors))
-        between: Floats = two - one
-        return between
 
 
 class Geometry(NamedTuple):

@@ -1,8 +1,8 @@
-"""Parts that a scene names: what each kind of them says of itself, and the rest of the program asks alike of all kinds.
+"""Parts that a scene names: what the program asks alike of all kinds of them.
 
-A kind is a class in a file of its own, and a line of `dem.scene.KINDS`. `Scene.named` and `World.named` have the parts
-by kind and name. Three kinds of kinds there are: `Named` is described, checked, changed and kept; a `Force` also acts
-on bodies before contacts do; `dem.parts.ends.Tie` are those between two bodies.
+A kind is a class in a file of its own, and a line of `dem.scene.KINDS`; `Scene.named` and `World.named` have its parts
+by their names. A part is described, checked, changed and kept (`Named`). It may give impulses before contacts do
+(`Force`), join two bodies (`dem.parts.ends.Tie`), and hold these (`dem.parts.ends.Constraint`).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Named:
 class Force(Named):
     """A part that gives bodies impulses which do not depend on the contacts of the step."""
 
-    MEMORY: ClassVar[int] = 0  #: numbers of each part that a step hands to the next one, and to reports
+    MEMORY: ClassVar[int] = 0  #: numbers of each part for the next step and reports; first the impulse (3,)
 
     @classmethod
     def act(cls, members: Mapping[str, Any], world: Any, applied: Any) -> Floats | None:

@@ -43,12 +43,19 @@ class Spring(Tie, Force):
     length: float = 0.0  #: at rest [m]
     CHANGED: ClassVar = ("stiffness", "damping", "length")
     KEPT: ClassVar = CHANGED
-    MEMORY: ClassVar = 15  #: velocities (2, 6) that its ends were to have, and its impulse (3,) on the second one
+    MEMORY: ClassVar = 15  #: its impulse (3,) on the second end, and velocities (2, 6) that the ends were to have
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("stiffness", "damping", "length"):
             object.__setattr__(self, name, float(checks.not_negative(f"{name} of a spring", getattr(self, name))))
+
+    def vector(self, what: str, scene: Any) -> Floats:
+        """The vector (3,) from the first anchor to the second in a scene at time zero [m]."""
+        poses = [scene.pose(what, end) for end in self.ends]
+        one, two = (place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, self.anchors))
+        between: Floats = two - one
+        return between
 
     def refuse(self, name: str, world: Any) -> None:
         super().refuse(name, world)
@@ -83,7 +90,7 @@ class Spring(Tie, Force):
     @classmethod
     def act(cls, members: Mapping[str, Any], world: Any, applied: Any) -> Floats:
         ends, dt, before = applied.ends(world, members), applied.dt, world.memory.get("spring")
-        expected = None if before is None else before[:, :12].reshape(-1, 2, 6)
+        expected = None if before is None else before[:, 3:].reshape(-1, 2, 6)
         given = list(members.values()), ends, expected, dt
         found = impulses(*given) if world.comm.rank == 0 else None
         g, change, expected, highest = world.comm.bcast(found)  # processors may round in other ways
@@ -93,7 +100,7 @@ class Spring(Tie, Force):
                 f"too large for them; take less than {2.0 / highest:.3g} s, and a tenth of that to resolve them"
             )
         applied.add(world, ends, change)
-        return np.concatenate([expected.reshape(-1, 12), g], axis=1)
+        return np.concatenate([g, expected.reshape(-1, 12)], axis=1)
 
 
 def vectors(springs: Sequence[Spring], ends: Ends) -> tuple[Floats, Floats]:

@@ -50,7 +50,7 @@ class Step:
         names = list(self.world.named["spring"])
         if name not in names:
             raise KeyError(f"no spring {name!r}; there are: {', '.join(names) or 'none'}")
-        force: Floats = self.world.memory["spring"][names.index(name), 12:] / self.system.dt
+        force: Floats = self.world.memory["spring"][names.index(name), :3] / self.system.dt
         return force
 
     @cached_property
