@@ -67,7 +67,8 @@ class Load(Force, Timed):
         if isinstance(self.on, str):
             of_name = [body for body in world.large_bodies if body.name == self.on]
             if of_name and not isinstance(of_name[0].motion, Dynamic):
-                raise ValueError(f"load {name!r}: the motion of body {self.on!r} is prescribed, so no force moves it")
+                what = f"the motion of the body {self.on!r} is prescribed, so no force moves it"
+                raise ValueError(f"load {name!r}: {what}")
             if bool(of_name) == (self.on in world.materials):
                 kind = "both a body and a material" if of_name else "neither a body nor a material"
                 raise ValueError(f"load {name!r}: {self.on!r} is {kind}")
