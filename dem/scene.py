@@ -13,9 +13,9 @@ by a `dem.arrays.Rule` takes no memory at all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Union
+from typing import Any, TypeVar, Union
 
 import numpy as np
 from mpi4py import MPI
@@ -28,13 +28,31 @@ from dem.measures import Block, Cylinder
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
 from dem.parts import cell, contact_law
 from dem.parts.contact_law import ContactLaw
+from dem.parts.ends import End
 from dem.parts.joints import Joint
 from dem.parts.loads import Law, Load, On
+from dem.parts.named import Named
 from dem.parts.sources import Outlet, Passages, Source
-from dem.parts.springs import End, Spring
+from dem.parts.springs import Spring
 from dem.quaternion import across, length
 from dem.shapes import Clump, Shape, clumps, polyhedra
 from dem.shapes.forms import Form
+
+#: The kinds of parts with names, in the order in which they act.
+KINDS: dict[str, type[Named]] = {"load": Load, "spring": Spring, "joint": Joint, "source": Source}
+
+N = TypeVar("N", bound=Named)
+
+
+def no_parts() -> dict[str, dict[str, Any]]:
+    """Parts by kind and name: none yet."""
+    return {kind: {} for kind in KINDS}
+
+
+def kinds_of(base: type[N], named: Mapping[str, dict[str, Any]]) -> list[tuple[str, type[N], dict[str, N]]]:
+    """The kinds derived from a class that have parts in `named`: name, class and the parts by their names."""
+    return [(kind, own, named[kind]) for kind, own in KINDS.items() if named[kind] and issubclass(own, base)]
+
 
 #: A velocity (3,), or a function of points (n, 3) [m] and outward normals (n, 3) that returns (3,) or (n, 3) [m/s].
 SurfaceVelocity = Union[Sequence[float], Callable[[Floats, Floats], ArrayLike]]
@@ -164,10 +182,8 @@ class Scene:
         self.parts: list[Part] = []  #: the grains, as they were added
         self._survey: Survey | None = None
         self.forms: list[Form] = []  #: the distinct shapes of clumps and polyhedra, see `dem.bodies`
-        self.loads: dict[str, Load] = {}  #: by name
-        self.springs: dict[str, Spring] = {}  #: by name
-        self.passages = Passages()  #: sources and outlets
-        self.joints: dict[str, Joint] = {}  #: by name
+        self.named = no_parts()  #: loads, springs, joints and sources by kind and name, see `KINDS`
+        self.passages = Passages(self.named["source"])  #: sources and outlets
 
     def add_spheres(
         self,
@@ -338,9 +354,9 @@ class Scene:
         function of the time [s] and the table of the bodies, see `dem.parts.loads.Load`. They act from `start` to
         `end` [s].
         """
-        if not name or name in self.loads or name in (body.name for body in self.large_bodies):
+        if not name or name in self.named["load"] or name in (body.name for body in self.large_bodies):
             raise ValueError(f"loads need names that no other load and no large body has, got {name!r}")
-        self.loads[name] = Load(on, force, torque, start, end)
+        self.named["load"][name] = Load(on, force, torque, start, end)
 
     def add_spring(
         self,
@@ -360,13 +376,11 @@ class Scene:
         of the world is a place [m]. stiffness [N/m], damping [N s/m], rest `length` [m]: None is the distance at time
         zero; with zero the spring acts in all directions.
         """
-        if not name or name in self.springs:
+        if not name or name in self.named["spring"]:
             raise ValueError(f"springs need distinct names, got {name!r}")
         spring = Spring((one, other), (anchor, other_anchor), stiffness, damping, 0.0 if length is None else length)
-        poses = [self.pose(f"spring {name!r}", end) for end in spring.ends]
-        places = [place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, spring.anchors)]
-        rest = float(np.linalg.norm(places[1] - places[0])) if length is None else length
-        self.springs[name] = replace(spring, length=rest)
+        rest = float(np.linalg.norm(spring.vector(f"spring {name!r}", self)))
+        self.named["spring"][name] = spring if length is not None else replace(spring, length=rest)
 
     def add_joint(
         self,
@@ -376,40 +390,27 @@ class Scene:
         *,
         kind: str = "hinge",
         anchor: Sequence[float],
-        axis: Sequence[float] = (0.0, 0.0, 1.0),
+        axis: ArrayLike = (0.0, 0.0, 1.0),
         speed: float | None = None,
         target: float | None = None,
         strength: float = np.inf,
         limits: Sequence[float] = (-np.inf, np.inf),
         touching: bool = False,
     ) -> None:
-        """Join two bodies, or a body and the world (None), by a "hinge", "slider", "ball" or "fixed" joint, see
-        `dem.parts.joints`.
+        """Join two bodies, or a body and the world (None), by a joint of a `kind` of `dem.parts.joints.KINDS`.
 
-        A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,) are in the
-        world at time zero, where angle and position are zero; they are those of `other` relative to `one`. A motor
-        keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a torque or force of at most `strength`
-        [N m, N]; inf: as much as it takes. `limits` (2,): least and greatest angle [rad] or position [m]. The two
-        bodies go through each other, unless they are `touching`.
+        A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,), or the axes
+        that the kind has, are in the world at time zero, where angle and position are zero; they are those of `other`
+        relative to `one`. A motor keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a torque or force
+        of at most `strength` [N m, N]; inf: as much as it takes. `limits` (2,): least and greatest angle [rad] or
+        position [m]. The two bodies go through each other, unless they are `touching`.
         """
-        if not name or name in self.joints:
+        if not name or name in self.named["joint"]:
             raise ValueError(f"joints need distinct names, got {name!r}")
-        place = checks.vector(f"anchor of {name!r}", anchor)
-        z = checks.unit_vector(f"axis of {name!r}", axis)
-        x = across(np.array(z)[None])[0]
-        upright = quaternion.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
-        anchors, frames = [], []
-        for position, turn in (self.pose(f"joint {name!r}", end) for end in (one, other)):
-            back, arm = quaternion.conjugate(turn), place - position
-            arm = arm - self.cell.whole(arm)
-            anchors.append(tuple(quaternion.rotate(back, arm).tolist()))
-            frames.append(tuple(quaternion.multiply(back, upright).tolist()))
-        for body in self.large_bodies:
-            if body.name in (one, other) and isinstance(body.motion, Driven):
-                raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
         low, high = map(float, limits)
-        motor = speed, target, float(strength)
-        self.joints[name] = Joint(kind, (one, other), anchors, frames, *motor, low, high, touching)
+        given = {"kind": kind, "speed": speed, "target": target, "strength": float(strength), "low": low, "high": high}
+        joint = Joint.between(name, (one, other), self, anchor, axis, **given, touching=touching)
+        self.named["joint"][name] = joint
 
     def pose(self, what: str, end: End) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) of an end of a spring or joint at time 0; ValueError if there is none."""
@@ -687,10 +688,6 @@ def _refuse_in_cell(scene: Scene, radius: float) -> None:
             raise ValueError(f"large body {scene.large_bodies[0].name!r}: a {what} has grains alone")
         if scene.passages:
             raise ValueError(f"{scene.passages.names[0]!r}: a {what} has no sources and outlets")
-        if scene.joints:
-            raise ValueError(f"joint {next(iter(scene.joints))!r}: a {what} has no joints")
-    if scene.springs:
-        raise ValueError(f"spring {next(iter(scene.springs))!r}: springs have no images, so periods allow none")
     for body in scene.large_bodies:
         if wrong := scene.cell.why_refused(body.name, body.motion, body.shapes, body.quaternion):
             raise ValueError(wrong)

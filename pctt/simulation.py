@@ -331,7 +331,7 @@ class Simulation:
     @property
     def loads(self) -> dict[str, Load]:
         """The loads by name; `change` changes them. Not collective."""
-        return dict(self.world.loads)
+        return dict(self.world.named["load"])
 
     def change(self, what: str, **values: Any) -> None:
         """Give a load, spring, joint, source, large body or the cell other values from now on::
@@ -359,7 +359,7 @@ class Simulation:
     @property
     def springs(self) -> dict[str, Spring]:
         """The springs by name; `change` changes them. Not collective."""
-        return dict(self.world.springs)
+        return dict(self.world.named["spring"])
 
     def spring_force(self, name: str) -> Floats:
         """Force (3,) of a spring on its second end, its mean over the last step [N]. ValueError before the first step,

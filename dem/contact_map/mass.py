@@ -1,8 +1,8 @@
 """The inverse mass of the bodies of a contact map: a block for each body, and what couples bodies beside contacts.
 
-Solvers see contacts alone, as what joints hold and the size of a cell are in the inverse mass M^-1. A coupling acts by
-few numbers that all ranks know, the shared coordinates s of impulses: M^-1 is the blocks of the other bodies, and a
-small matrix of s. An image of impulses (see `dem.contact_map.ContactMap`) has s behind the momenta of the bodies.
+Solvers see contacts alone, as what constraints hold and the size of a cell are in the inverse mass M^-1. A coupling
+acts by few numbers that all ranks know, the shared coordinates s of impulses: M^-1 is the blocks of the other bodies,
+and a small matrix of s. An image of impulses (see `dem.contact_map.ContactMap`) has s behind the momenta of the bodies.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dem.contact_map import loops
 from dem.contact_map.rows import BlockRows, root_blocks, squared
 from dem.exchange import offsets
 
-ROUNDING = 1e-14  # of the coupling of bodies that no chain of joints joins
+ROUNDING = 1e-14  # of the coupling of bodies that no chain of constraints joins
 
 
 class InverseMass:
@@ -77,16 +77,16 @@ class InverseMass:
         return known
 
 
-class JointedMass(InverseMass):
-    """The inverse mass of bodies that joints couple.
+class ConstrainedMass(InverseMass):
+    """The inverse mass of bodies that constraints couple, such as joints.
 
-    With B the rows of the joints in the mass-scaled velocities and e >= 0 what they yield (0: not at all), joints turn
+    With B the rows of constraints in the mass-scaled velocities and e >= 0 what they yield (0: not at all), they turn
     the inverse mass I into I - B' (B B' + e)^-1 B = (I - K)^2 with K symmetric: R is then R (I - K). The shared
-    coordinates are the mass-scaled momenta of the jointed bodies. Impulses of joints have no sign and need no cone;
+    coordinates are the mass-scaled momenta of these bodies. Impulses of constraints have no sign and need no cone;
     what is left is the same cone problem of the contacts.
 
-    here, slot : own rows of jointed bodies, and their places among all of these
-    coupling : K (6 n, 6 n) of the n jointed bodies, the same on all ranks
+    here, slot : own rows of constrained bodies, and their places among all of these
+    coupling : K (6 n, 6 n) of the n constrained bodies, the same on all ranks
     """
 
     couples = True
@@ -102,16 +102,16 @@ class JointedMass(InverseMass):
         self.alone[here] = 0.0
         self._root = root_blocks(root[here])
 
-    def scaled(self, size: Floats, precision: type[np.floating]) -> JointedMass:
-        return JointedMass(self.comm, self.given, self.here, self.slot, self.coupling, precision)
+    def scaled(self, size: Floats, precision: type[np.floating]) -> ConstrainedMass:
+        return ConstrainedMass(self.comm, self.given, self.here, self.slot, self.coupling, precision)
 
     def uncoupled(self, z: Floats) -> Floats:
-        """(I - K) z for z (shared, 6) of all jointed bodies."""
+        """(I - K) z for z (shared, 6) of all constrained bodies."""
         x = z.astype(float, copy=False)
         return x - (self.coupling @ x.ravel()).reshape(-1, 6)
 
     def gathered(self, v: Floats) -> Floats:
-        """The rows (shared, 6) of the jointed bodies among those v (columns, 6) of all ranks; collective."""
+        """The rows (shared, 6) of the constrained bodies among those v (columns, 6) of all ranks; collective."""
         out = np.zeros((self.shared, 6))
         out[self.slot] = v[self.here]
         self.comm.Allreduce(MPI.IN_PLACE, out)
@@ -140,7 +140,7 @@ class JointedMass(InverseMass):
         w[self.here] += self._scaled(self.uncoupled(self.uncoupled(s))[self.slot])
 
     def _scaled(self, m: Floats) -> Floats:
-        """R m (k, 6) of the own jointed bodies."""
+        """R m (k, 6) of the own constrained bodies."""
         both = np.einsum("npij,npj->npi", self._root, m.reshape(-1, 2, 3))
         return both.reshape(-1, 6)
 
@@ -149,15 +149,15 @@ class JointedMass(InverseMass):
         return float(np.vdot(z, z)) if self.comm.rank == 0 else 0.0
 
     def rows(self, comm: MPI.Comm, known: BlockRows) -> BlockRows:
-        """Contacts of a jointed body have a block for each body that joints join it with."""
+        """Contacts of a constrained body have a block for each body that constraints couple it with."""
         number = np.zeros(self.shared, np.int64)
         number[self.slot] = offsets(comm, known.columns)[comm.rank] + self.here
         comm.Allreduce(MPI.IN_PLACE, number)
         bodies, place = np.unique(np.concatenate([known.indices, number]), return_inverse=True)
         size, place = 6 * len(bodies), place.ravel()
-        jointed = (6 * place[len(known.indices) :, None] + np.arange(6)).ravel()
+        coupled = (6 * place[len(known.indices) :, None] + np.arange(6)).ravel()
         row, column = np.nonzero(np.abs(self.coupling) > ROUNDING)
-        K = sp.csr_matrix((self.coupling[row, column], (jointed[row], jointed[column])), shape=(size, size))
+        K = sp.csr_matrix((self.coupling[row, column], (coupled[row], coupled[column])), shape=(size, size))
         R = (sp.identity(size, format="csr") - K).tobsr((6, 6))
         G = sp.bsr_matrix((known.blocks, place[: len(known.indices)], known.indptr), shape=(3 * known.rows, size))
         found = (G @ R).tobsr((3, 6))

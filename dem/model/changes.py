@@ -1,4 +1,4 @@
-"""What a run changes of the world: loads, springs, joints, sources, motions and surfaces of large bodies, and the cell.
+"""What a run changes of the world: parts, motions and surfaces of large bodies, and the cell.
 
 All ranks call these functions alike, with the same arguments. Checkpoints keep the changes.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -19,25 +18,23 @@ from dem.arrays import Floats
 from dem.checks import nearest
 from dem.model.world import World
 from dem.motion import Dynamic, Motion, Pose, Prescribed, checked_pose
-from dem.parts.loads import Load
 from dem.parts.named import Named
-from dem.scene import LargeBody, checked_surface
+from dem.scene import KINDS, LargeBody, checked_surface
 
-#: The fields of a `World` that have parts by their names, by what a part is called.
-PARTS = {"load": "loads", "spring": "springs", "joint": "joints", "source": "passages.sources"}
-KINDS = (*PARTS, "body", "cell")
+CHANGED = (*KINDS, "body", "cell")  #: the kinds of what may be changed
 
 
 def change(world: World, what: str, **values: Any) -> None:
     """Give a part other values from now on. ValueError for what is not there, and for values that it cannot have.
 
-    `what` is a kind and a name: "load wind", "spring tie", "joint axle", "source rain" with values of the class's
-    `CHANGED`; "body belt" with `motion`, or parameters of its present one, and `surface_velocity`; or "cell" with
-    `shear_rate`, `stress` and `strain_rate`. A load that is not there begins, if `on` is among the values.
+    `what` is a kind of `dem.scene.KINDS` and a name, such as "spring tie", with values of the class's `CHANGED`; "body
+    belt" with `motion`, or parameters of its present one, and `surface_velocity`; or "cell" with `shear_rate`, `stress`
+    and `strain_rate`. A part that is not there begins, if the class's `BEGINS` is among the values.
     """
     kind, _, name = what.partition(" ")
-    if kind not in KINDS:
-        raise ValueError(f"{what!r}: allowed are {', '.join(KINDS[:-1])} with a name, and cell" + nearest(kind, KINDS))
+    if kind not in CHANGED:
+        allowed = f"allowed are {', '.join(CHANGED[:-1])} with a name, and cell"
+        raise ValueError(f"{what!r}: {allowed}{nearest(kind, CHANGED)}")
     refuse_functions(what, values)
     if kind == "cell":
         _refuse_others(what, values, world.cell.CHANGED)
@@ -56,35 +53,21 @@ def refuse_functions(what: str, values: Mapping[str, Any]) -> None:
 
 
 def _change_part(world: World, kind: str, name: str, **values: Any) -> None:
-    there: dict[str, Named] = attrgetter(PARTS[kind])(world)
-    part = there.get(name)
-    if part is None and kind == "load" and "on" in values:
-        part = Load(values["on"])
+    there: dict[str, Named] = world.named[kind]
+    part, begins = there.get(name), KINDS[kind].BEGINS
+    if part is None and begins in values:
+        part = KINDS[kind](values[begins])  # type: ignore[call-arg]
     if part is None:
-        begins = "; give on=... to begin one" * (kind == "load")
-        raise ValueError(f"no {kind} {name!r}; there are: {', '.join(there) or 'none'}{nearest(name, there)}{begins}")
+        how = f"; give {begins}=... to begin one" * bool(begins)
+        raise ValueError(f"no {kind} {name!r}; there are: {', '.join(there) or 'none'}{nearest(name, there)}{how}")
     _refuse_others(f"{kind} {name!r}", values, part.CHANGED)
     _put(world, kind, name, part.changed(world.time, world.passages.tallies.get(name), **values))
 
 
 def _put(world: World, kind: str, name: str, part: Named) -> None:
-    if isinstance(part, Load):
-        refuse_load(world, name, part)
-    attrgetter(PARTS[kind])(world)[name] = part
+    part.refuse(name, world)
+    world.named[kind][name] = part
     world.changed.add((kind, name))
-
-
-def refuse_load(world: World, name: str, load: Load) -> None:
-    """ValueError for a load on bodies that are not there, or that no force moves; not collective."""
-    if isinstance(load.on, str):
-        bodies_of_name = [body for body in world.large_bodies if body.name == load.on]
-        if bodies_of_name and not isinstance(bodies_of_name[0].motion, Dynamic):
-            raise ValueError(f"load {name!r}: the motion of the body {load.on!r} is prescribed, so no force moves it")
-        if bool(bodies_of_name) == (load.on in world.materials):
-            kind = "both a body and a material" if bodies_of_name else "neither a body nor a material"
-            raise ValueError(f"load {name!r}: {load.on!r} is {kind}")
-    elif load.ids is not None and len(wrong := load.ids[(load.ids < 0) | (load.ids >= world.ids)]):
-        raise ValueError(f"load {name!r}: there is no grain {wrong[0]}")
 
 
 # -- large bodies --------------------------------------------------------------------------------------------
@@ -150,7 +133,7 @@ def changes(world: World) -> str:
         if kind == "body":
             entry = _entry(world.large_bodies[world.large_row(name)])
         else:
-            part = attrgetter(PARTS[kind])(world)[name]
+            part = world.named[kind][name]
             entry = {key: getattr(part, key) for key in part.KEPT}
         found.setdefault(kind, {})[name] = {key: value for key, value in entry.items() if not callable(value)}
     return json.dumps(found, default=lambda array: array.tolist())
@@ -163,10 +146,10 @@ def restore(world: World, text: str) -> None:
             if kind == "body":
                 world.replace_large(_restored(world.large_bodies[world.large_row(name)], entry))
                 continue
-            there = attrgetter(PARTS[kind])(world)
-            if name not in there and kind != "load":
+            part: Any = world.named[kind].get(name)
+            if part is None and not KINDS[kind].BEGINS:
                 raise ValueError(f"the scene has no {kind} {name!r}")
-            part = there.get(name) or Load(None)
+            part = KINDS[kind](None) if part is None else part  # type: ignore[call-arg]
             _refuse_others(f"{kind} {name!r}", entry, part.KEPT)
             _put(world, kind, name, dataclasses.replace(part, **entry))
 

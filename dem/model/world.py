@@ -16,17 +16,14 @@ from dem.bodies import Bodies
 from dem.motion import Dynamic, Pose, checked_pose
 from dem.parts.cell import OPEN, Cell
 from dem.parts.contact_law import ContactLaw
-from dem.parts.joints import Joint
-from dem.parts.loads import Load
 from dem.parts.sources import Passages
-from dem.parts.springs import Spring
-from dem.scene import LargeBody
+from dem.scene import LargeBody, no_parts
 from dem.shapes.forms import Form
 from dem.together import together
 
 #: The fields of a world that a step changes; what these refer to is replaced, and never changed in place.
 STATE = (
-    "grains", "large", "slabs", "only_spheres", "lists", "expected", "cell", "passages", "time", "step", "spare",
+    "grains", "large", "slabs", "only_spheres", "lists", "memory", "cell", "passages", "time", "step", "spare",
 )  # fmt: skip
 
 
@@ -46,10 +43,9 @@ class World:
     materials: tuple[str, ...]  #: their names; the column `material` of a table of bodies is an index into them
     grains: Bodies  #: the slab of this rank; replace it by `set_grains` only
     large: Bodies  #: one row per large body
-    loads: dict[str, Load] = field(default_factory=dict)  #: by name; `dem.model.changes.change` alone changes parts
-    springs: dict[str, Spring] = field(default_factory=dict)  #: by name
-    joints: dict[str, Joint] = field(default_factory=dict)  #: by name
-    #: pairs of ids, the lower + 1j the upper, of bodies that joints join and that do not touch each other
+    #: parts by kind and name, see `dem.scene.KINDS`; `dem.model.changes.change` alone changes them
+    named: dict[str, dict[str, Any]] = field(default_factory=no_parts)
+    #: pairs of ids, the lower + 1j the upper, of bodies at the ends of a part that do not touch each other
     apart: Keys = field(default_factory=lambda: np.zeros(0, complex))
     cell: Cell = OPEN
     passages: Passages = field(default_factory=Passages)  #: where grains come and go
@@ -62,13 +58,13 @@ class World:
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
 
-    #: Kinds and names of what a run has changed by `dem.model.changes.change`: large bodies, loads, springs and others.
+    #: Kinds and names of the parts and large bodies that a run has changed by `dem.model.changes.change`.
     changed: set[tuple[str, str]] = field(init=False, default_factory=set)
 
     lists: Any = field(init=False, repr=False, default=None)  #: the `dem.contact.lists.Lists` of the last search
 
-    #: Velocities (springs, 2, 6) that the ends of springs were to have after the last step without contacts and drives.
-    expected: Floats | None = field(init=False, default=None)
+    #: What parts of a kind, by its name, hand from the last step to the next: (parts, `dem.parts.named.Force.MEMORY`).
+    memory: dict[str, Floats] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
@@ -89,8 +85,7 @@ class World:
         ones."""
         replicated = {f"large_{name}": column for name, column in self.large.columns().items()}
         replicated.update(slabs=self.slabs, time=np.array(self.time), step=np.array(self.step))
-        if self.expected is not None:
-            replicated["expected"] = self.expected
+        replicated.update({f"memory_{kind}": array for kind, array in self.memory.items()})
         replicated["spare"] = np.array(self.spare)
         return self.grains.columns(), replicated | self.passages.state() | self.cell.state()
 

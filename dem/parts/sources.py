@@ -240,9 +240,9 @@ class Passages:
             self.outlets[name] = part
 
     def counted(self) -> Passages:
-        """The same with tallies of its own, which are as these."""
+        """The same sources and outlets with other tallies, which are as these."""
         tallies = {name: replace(self.tallies.get(name, Tally())) for name in self.names}
-        return Passages(dict(self.sources), dict(self.outlets), tallies)
+        return Passages(self.sources, self.outlets, tallies)
 
     @property
     def came(self) -> int:

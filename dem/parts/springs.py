@@ -18,75 +18,110 @@ bears does not see it fall, and what a damper misses in the step of an impact it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Union
+from typing import Any, ClassVar
 
 import numpy as np
 
 from dem import checks, quaternion
 from dem.arrays import Floats
-from dem.parts.named import Named
+from dem.parts.ends import End, Ends, Tie
+from dem.parts.named import Force, Pressing
+from dem.together import SceneError
 
-#: A large body by its name, a grain by its id, or the world.
-End = Union[str, int, None]
+RESOLVED = 0.2  #: the step times the highest frequency of springs; 2 is their limit
 
 
 @dataclass(frozen=True)
-class Spring(Named):
+class Spring(Tie, Force):
     """A spring with a damper. Anchors are in the frames of their bodies, or places in the world."""
 
-    ends: tuple[End, End]
-    anchors: Sequence[Sequence[float]]  #: (2, 3) [m]
     stiffness: float = 0.0  #: [N/m]
     damping: float = 0.0  #: [N s/m]
     length: float = 0.0  #: at rest [m]
     CHANGED: ClassVar = ("stiffness", "damping", "length")
     KEPT: ClassVar = CHANGED
+    MEMORY: ClassVar = 15  #: its impulse (3,) on the second end, and velocities (2, 6) that the ends were to have
 
     def __post_init__(self) -> None:
-        ends = tuple(end if end is None or isinstance(end, str) else int(end) for end in self.ends)
-        if ends[0] == ends[1]:
-            raise ValueError(f"both ends of a spring are at {ends[0]}: allowed are two bodies, or a body and the world")
-        anchors = tuple(tuple(checks.vector("anchor of a spring", anchor).tolist()) for anchor in self.anchors)
-        object.__setattr__(self, "ends", ends)
-        object.__setattr__(self, "anchors", anchors)
+        super().__post_init__()
         for name in ("stiffness", "damping", "length"):
             object.__setattr__(self, name, float(checks.not_negative(f"{name} of a spring", getattr(self, name))))
 
+    def vector(self, what: str, scene: Any) -> Floats:
+        """The vector (3,) from the first anchor to the second in a scene at time zero [m]."""
+        poses = [scene.pose(what, end) for end in self.ends]
+        one, two = (place + quaternion.rotate(turn, np.array(at)) for (place, turn), at in zip(poses, self.anchors))
+        between: Floats = two - one
+        return between
 
-@dataclass(frozen=True)
-class Ends:
-    """The bodies at the ends of springs, and the world as the last row."""
+    def refuse(self, name: str, world: Any) -> None:
+        super().refuse(name, world)
+        if world.cell.periodic:
+            raise ValueError(f"spring {name!r}: springs have no images, so periods allow none")
 
-    position: Floats  #: (n, 3) [m]
-    quaternion: Floats  #: (n, 4)
-    velocity: Floats  #: (n, 6) before the step
-    free: Floats  #: (n, 6) after the step, without contacts, springs and drives [m/s, rad/s]
-    inverse_mass: Floats  #: (n, 6, 6)
-    moments: Floats  #: (n, 3) principal moments of inertia, inf: it does not turn freely [kg m^2]
-    given: Floats  #: (n, 3) what loads and springs change of the angular velocities in `free` [rad/s]
+    @classmethod
+    def pressing(cls, members: Mapping[str, Any], scene: Any, body: Callable[[Any], tuple[float, ...]]) -> Pressing:
+        """The greatest force on a body, what springs let meet, and a time step for a bound of their frequencies, see
+        `impulses`."""
+        ends: dict[End, list[tuple[float, float, float]]] = {}
+        impacts = []
+        for spring in members.values():
+            stretch = abs(float(np.linalg.norm(spring.vector("spring", scene))) - spring.length)
+            force, light = spring.stiffness * stretch, 0.0
+            for end, at in zip(spring.ends, spring.anchors):
+                ends.setdefault(end, []).append((force, math.sqrt(spring.stiffness), math.hypot(*at)))
+                light += 1.0 / body(end)[0]
+            if light > 0.0 and force > 0.0:
+                damped = force / spring.damping if spring.damping > 0.0 else np.inf
+                impacts.append((1.0 / light, min(stretch * math.sqrt(spring.stiffness * light), damped)))
+        greatest, square = 0.0, 0.0
+        for end, held in ends.items():
+            mass, moment, _ = body(end)
+            pull, root, arm = np.array(held).T
+            greatest = max(greatest, float(pull.sum()))
+            square = max(square, float((root * (root.sum() / mass + arm * (root @ arm) / moment)).max()))
+        highest = math.sqrt(2.0 * square)
+        steps = ((f"springs of {highest:.3g} rad/s", RESOLVED / highest),) if highest > 0.0 else ()
+        return Pressing(greatest, impacts=tuple(impacts), steps=steps)
+
+    @classmethod
+    def act(cls, members: Mapping[str, Any], world: Any, applied: Any) -> Floats:
+        ends, dt, before = applied.ends(world, members), applied.dt, world.memory.get("spring")
+        expected = None if before is None else before[:, 3:].reshape(-1, 2, 6)
+        given = list(members.values()), ends, expected, dt
+        found = impulses(*given) if world.comm.rank == 0 else None
+        g, change, expected, highest = world.comm.bcast(found)  # processors may round in other ways
+        if dt * highest >= 2.0:
+            raise SceneError(
+                f"the springs {', '.join(members)[:200]} have frequencies up to {highest:.3g} rad/s: -dt {dt:g} s is "
+                f"too large for them; take less than {2.0 / highest:.3g} s, and a tenth of that to resolve them"
+            )
+        applied.add(world, ends, change)
+        return np.concatenate([g, expected.reshape(-1, 12)], axis=1)
 
 
-def vectors(springs: list[Spring], row: np.ndarray, ends: Ends) -> tuple[Floats, Floats]:
-    """Arms (2, s, 3) from the centres of the bodies in the rows `row` (s, 2) to the anchors, and the vectors (s, 3)
-    from the first anchors to the second [m]."""
-    anchors = np.array([spring.anchors for spring in springs])
+def vectors(springs: Sequence[Spring], ends: Ends) -> tuple[Floats, Floats]:
+    """Arms (2, s, 3) from the centres of the bodies to the anchors, and the vectors (s, 3) from the first anchors to
+    the second [m]."""
+    row, anchors = ends.row, np.array([spring.anchors for spring in springs])
     arm = np.array([quaternion.rotate(ends.quaternion[row[:, k]], anchors[:, k]) for k in (0, 1)])
     return arm, ends.position[row[:, 1]] + arm[1] - ends.position[row[:, 0]] - arm[0]
 
 
 def impulses(
-    springs: list[Spring], row: np.ndarray, ends: Ends, expected: Floats | None, dt: float
+    springs: Sequence[Spring], ends: Ends, expected: Floats | None, dt: float
 ) -> tuple[Floats, Floats, Floats, float]:
-    """Of springs between bodies in the rows `row` (s, 2): impulses (s, 3) on the second anchors over a step of dt [s],
-    impulses and angular impulses (n, 6) on the bodies, the velocities (s, 2, 6) that the ends are expected to have
-    after it without contacts and drives, and the bound w [1/s] of the frequencies. `expected` (s, 2, 6): those of the
-    last step, None if there was none."""
+    """Of springs between these ends: impulses (s, 3) on the second anchors over a step of dt [s], impulses and angular
+    impulses (n, 6) on the bodies, the velocities (s, 2, 6) that the ends are expected to have after it without contacts
+    and drives, and the bound w [1/s] of the frequencies. `expected` (s, 2, 6): those of the last step, None if there
+    was none."""
     numbers = [(spring.stiffness, spring.damping, spring.length) for spring in springs]
     k, c, rest = np.array(numbers).T
-    arm, d = vectors(springs, row, ends)
-    many = len(springs)
+    arm, d = vectors(springs, ends)
+    row, many = ends.row, len(springs)
     A = np.zeros((many, 2, 3, 6))  # from velocities of the ends to rates of d
     for side, sign in ((0, -1.0), (1, 1.0)):
         A[:, side, :, :3] = sign * np.eye(3)

@@ -23,7 +23,7 @@ from dem.start import stiffness
 from dem.step import Step
 from dem.step.servo import cell_stress
 from dem.together import SceneError, digest, together
-from dem.unconstrained import slots
+from dem.unconstrained.constraints import slots
 
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:
@@ -134,7 +134,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     impulses do the work g' D' w. What its tangential part does not give to the springs of contacts is the friction
     loss. What its normal part does not is lost in impacts, or pushes overlaps of rigid contacts apart where it is a
     gain. The work of motions is that of prescribed bodies on the others, of the drives of guided and hinged bodies, of
-    what holds bodies in part, of belts, loads, springs and the shear of a cell. The rest is the error of the semi-
+    what holds bodies in part, of belts, of parts and of the shear of a cell. The rest is the error of the semi-
     implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
 
     Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be, but hold
@@ -159,9 +159,9 @@ def energy_balance(step: Step) -> dict[str, float]:
     normal, tangential, opening = works(step, step.in_cone, velocity, step.moment)
     elastic, elastic_at_end, strained, strained_at_end = spring_energies(step, velocity, opening)
     cohesion = 0.0 if system.attraction is None else works(step, step.impulse, velocity)[0] - normal
-    loads = belts = flow = 0.0
+    applied = belts = flow = 0.0
     if system.applied is not None:
-        loads = 0.5 * np.vdot(system.applied.grains, before[0].velocity + world.grains.velocity)
+        applied = 0.5 * np.vdot(system.applied.grains, before[0].velocity + world.grains.velocity)
     if system.surface is not None:
         belts = -np.vdot(step.impulse[:, 1:], system.surface)
     if system.drift is not None:
@@ -170,17 +170,17 @@ def energy_balance(step: Step) -> dict[str, float]:
         comm, kinetic_before=was[0], potential_before=was[1], kinetic=now[0], potential=now[1], normal=normal,
         tangential=tangential, elastic=elastic, elastic_at_end=elastic_at_end, strained=strained,
         strained_at_end=strained_at_end, still=still, least=least, carried=_carried(step, ~moves), cohesion=cohesion,
-        loads=loads, belts=belts, flow=flow,
+        applied=applied, belts=belts, flow=flow,
     )  # fmt: skip
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
-    joints, joints_at_end = _joint_works(step, before[0].velocity, mean)
-    driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + (whole["loads"] + whole["flow"])
-    driving = driving + whole["belts"] + (holding + joints)
+    held_by, held_at_end = _constraint_works(step, before[0].velocity, mean)
+    driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + (whole["applied"] + whole["flow"])
+    driving = driving + whole["belts"] + (holding + held_by)
     work = driving - np.vdot(step.impulse_on_large[~moves], mean[~moves])
     rise, fallen = whole["kinetic"] - whole["kinetic_before"], whole["potential_before"] - whole["potential"]
     held, bent = whole["elastic_at_end"] - whole["elastic"], whole["strained_at_end"] - whole["strained"]
     pulled, released = 2.0 * max(whole["cohesion"], 0.0), max(-held, 0.0) + max(-bent, 0.0)
-    pulled += max(joints_at_end - joints, 0.0)  # with the velocity of the end, for bodies that were at rest
+    pulled += max(held_at_end - held_by, 0.0)  # with the velocity of the end, for bodies that were at rest
     there = whole["kinetic_before"] + whole["still"] + whole["carried"]
     stored = whole["elastic"] + whole["strained"]
     created = rise - fallen - work - released - pulled > CREATED * (there + stored + abs(work))
@@ -287,14 +287,14 @@ def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
     return work
 
 
-def _joint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, float]:
-    """The work [J] of joints and their motors on the bodies that forces move, on the mean velocities of the step and on
+def _constraint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, float]:
+    """The work [J] of constraints and motors on the bodies that forces move, on the mean velocities of the step and on
     those of its end: velocities (grains, 6) of this rank's grains before the step, and means (large, 6) of those before
     and after; collective."""
     system, world = step.system, step.world
-    if system.joints is None:
+    if system.coupling is None:
         return 0.0, 0.0
-    push = np.einsum("k,knx->nx", step.joint_impulses, system.joints.rows)
+    push = np.einsum("k,knx->nx", step.constraint_impulses, system.coupling.rows)
     here, slot = slots(world, world.grains.id)
     velocity = world.grains.velocity[here]
     works = np.array([0.5 * np.vdot(push[slot], before[here] + velocity), np.vdot(push[slot], velocity)])

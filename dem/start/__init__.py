@@ -16,11 +16,13 @@ from dem.bodies import Bodies
 from dem.contact import find_contacts
 from dem.contact.primitives import refuse_untouchable
 from dem.exchange import exchange, refuse
-from dem.model.changes import refuse_load
 from dem.model.images import put_back
 from dem.model.partition import redistribute
 from dem.model.world import World
-from dem.scene import Scene, least_half
+from dem.parts.ends import Tie
+from dem.parts.named import Force
+from dem.parts.sources import Passages
+from dem.scene import Scene, kinds_of, least_half
 from dem.shapes.forms import Form
 from dem.start import stiffness
 from dem.together import together
@@ -71,8 +73,10 @@ def restored_world(
         )
     world.large = Bodies(**large)
     world.time, world.step = float(replicated["time"]), int(replicated["step"])
-    expected = np.array(replicated["expected"]) if "expected" in replicated else None
-    world.expected = expected if expected is not None and expected.shape == (len(world.springs), 2, 6) else None
+    for kind, acting, members in kinds_of(Force, world.named):
+        memory = np.array(replicated.get(f"memory_{kind}", ()), float)
+        if acting.MEMORY and memory.shape == (len(members), acting.MEMORY):
+            world.memory[kind] = memory
     world.spare = float(replicated["spare"])
     _refuse_impossible(world)
     if len(replicated["slabs"]) != comm.size + 1:
@@ -132,22 +136,18 @@ def even_slice(count: int, comm: MPI.Comm) -> slice:
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
-    world.loads, world.springs, world.cell = dict(scene.loads), dict(scene.springs), scene.cell
+    world.named, world.cell = {kind: dict(members) for kind, members in scene.named.items()}, scene.cell
     world.forms = tuple(scene.forms)
     refuse_untouchable(scene.kinds, scene.large_bodies)
-    world.passages = scene.passages.counted()
+    world.passages = Passages(world.named["source"], dict(scene.passages.outlets)).counted()
     world.initial, world.first_large = scene.count, scene.first_large
-    for what, members in (("spring", world.springs), ("joint", scene.joints)):
-        tied = [name for name, member in members.items() if any(isinstance(end, int) for end in member.ends)]
-        if tied and world.passages.outlets:
-            raise ValueError(f"{what} {tied[0]!r} holds a grain: with outlets {what}s may hold large bodies alone")
-    world.joints = dict(scene.joints)
-    number = {body.name: int(id) for body, id in zip(world.large_bodies, world.large.id)}
-    ends = [joint.ends for joint in world.joints.values() if None not in joint.ends and not joint.touching]
-    ids = [sorted(end if isinstance(end, int) else number[str(end)] for end in pair) for pair in ends]  # type: ignore[index]
-    world.apart = np.unique(np.array(ids, float).reshape(-1, 2) @ [1.0, 1.0j])
-    for name, load in world.loads.items():
-        refuse_load(world, name, load)
+    number = {body.name: int(id) for body, id in zip(world.large_bodies, world.large.id)} | {None: -1}
+    parts = [part for _, _, members in kinds_of(Tie, world.named) for part in members.values() if not part.touching]
+    ids = [sorted(end if isinstance(end, int) else number[end] for end in part.ends) for part in parts]
+    world.apart = np.unique(np.array([pair for pair in ids if pair[0] >= 0], float).reshape(-1, 2) @ [1.0, 1.0j])
+    for members in world.named.values():
+        for name, part in members.items():
+            part.refuse(name, world)
     return world
 
 
@@ -155,7 +155,7 @@ def _refuse_overlap(world: World, overlap: float) -> None:
     """ValueError, on all ranks, that names the worst pair if bodies overlap by more than `overlap` half thicknesses of
     the thinner one that forces move.
 
-    Bodies that a joint joins may share a place, unless they are to touch, and so may those that no force can part
+    Bodies at the ends of a part that do not touch each other may share a place, and so may those that no force can part
     (`held_overlap`)."""
     contacts = find_contacts(world, 0.0)
     table = contacts.near.bodies

@@ -35,10 +35,11 @@ from dem.arrays import ArrayLike, Floats, Ints
 from dem.compiled import inlined, loop
 from dem.motion import Dynamic
 from dem.parts.contact_law import ContactLaw
+from dem.parts.named import Pressing
 from dem.scene import Scene
 from dem.shapes import Plane, placed
 from dem.start.falls import DENSE, area, fall
-from dem.start.pressing import CHAINS, Pressing, pressing
+from dem.start.pressing import CHAINS, pressing
 from dem.start.time_step import fastest_grain, fastest_tool
 from dem.start.time_step import recommended as recommended_step
 

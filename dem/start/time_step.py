@@ -15,16 +15,16 @@ from dem import bodies
 from dem.arrays import Floats
 from dem.contact.primitives import extents
 from dem.motion import top_speed
+from dem.parts.named import Pressing
 from dem.scene import LargeBody, Scene
 from dem.shapes import Plane
 from dem.start.falls import fall
-from dem.start.pressing import Pressing, pressing
+from dem.start.pressing import pressing
 from dem.start.turns import TURN, turning_of_large
 
 DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/choose.md has the errors of forces
 FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
 FALLS = 1.5  #: the way in a step, in radii, of a grain that has fallen; two are the limit of `dem.step.fast`
-SPRINGS = 0.2  #: the step times the highest frequency of springs; 2 is their limit
 PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same and steps take a quarter longer
 
 
@@ -50,9 +50,7 @@ def needs(scene: Scene) -> dict[str, float]:
     found |= {what: _rounded(dt) for what, dt in scene.cell.needs(scene.expected()).items()}
     if (spin := fastest_turn(scene)) > 0.0:
         found[f"bodies that turn at {spin:.3g} rad/s"] = _rounded(TURN / spin)
-    if pressed.highest > 0.0:
-        found[f"springs of {pressed.highest:.3g} rad/s"] = _rounded(SPRINGS / pressed.highest)
-    return found
+    return found | {what: _rounded(step) for what, step in pressed.steps}
 
 
 def reason(scene: Scene) -> str:

@@ -46,16 +46,16 @@ class Step:
 
     def spring_force(self, name: str) -> Floats:
         """Force (3,) of a spring on its second end, averaged over the step [N]; the first has the opposite one."""
-        names = list(self.world.springs)
-        if name not in names or self.system.applied is None:
+        names = list(self.world.named["spring"])
+        if name not in names:
             raise KeyError(f"no spring {name!r}; there are: {', '.join(names) or 'none'}")
-        force: Floats = self.system.applied.springs[names.index(name)] / self.system.dt
+        force: Floats = self.world.memory["spring"][names.index(name), :3] / self.system.dt
         return force
 
     @cached_property
-    def joint_impulses(self) -> Floats:
-        """`ContactSystem.joint_impulses` of this step; collective at its first use."""
-        return self.system.joint_impulses(self.impulse, self.moment)
+    def constraint_impulses(self) -> Floats:
+        """`ContactSystem.constraint_impulses` of this step; collective at its first use."""
+        return self.system.constraint_impulses(self.impulse, self.moment)
 
     def position(self, name: str) -> Floats:
         """Position (3,) of a large body [m]."""
@@ -153,7 +153,7 @@ def advance(
     if world.cell.deforms:
         world.grains.position = world.grains.position + dt * world.cell.rate * start
     if free.applied is not None:
-        world.expected = free.applied.expected
+        world.memory = free.applied.memory
     world.cell = world.cell.after(dt)
     world.time += dt
     world.step += 1

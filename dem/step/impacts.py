@@ -26,7 +26,8 @@ from dem.contact import Contacts, velocities_about
 from dem.exchange import on_any
 from dem.geometry.vectors import cross, dot, plus
 from dem.model.world import World
-from dem.unconstrained import UnconstrainedMotion, jointed
+from dem.unconstrained import UnconstrainedMotion
+from dem.unconstrained.constraints import constrained
 
 #: Kinds of contacts: of two spheres, of a sphere that bounces from a body that forces do not move, and all others.
 PAIR, WALL, OTHER = 0, 1, 2
@@ -58,8 +59,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     grains, old = near.grains + near.ghosts, table.velocity
     ball = table.shape == SPHERE
     ball[grains:] = False
-    if world.joints:
-        ball &= ~np.isin(table.id, jointed(world)[0])
+    ball &= ~np.isin(table.id, constrained(world)[0])
     if pairs.restitution.any():
         old = old.copy()
         old[grains:] = motion.prescribed

@@ -12,7 +12,7 @@ from dem.contact_map.halo import Halo
 from dem.exchange import exchange, on_any
 from dem.model.world import World
 from dem.step.system import ContactSystem
-from dem.unconstrained import slots
+from dem.unconstrained.constraints import slots
 
 ROUND = 3  #: contacts that a single sphere may have at rest
 
@@ -31,7 +31,7 @@ def contacts_at_rest(world: World, system: ContactSystem, passing: Floats, slow:
     near, contact_map = system.near, system.contact_map
     moves = bodies.is_dynamic(near.bodies)
     jointed = np.zeros(len(moves), np.bool_)
-    if system.joints is not None:
+    if system.coupling is not None:
         jointed[slots(world, near.bodies.id)[0]] = True
     jointed &= moves
     root = _roots(contact_map.body, moves, jointed)
@@ -113,8 +113,8 @@ def _spread(root, name):
 
 @loop
 def _add_energies(root, moves, mass, inertia, velocity, free, sums):
-    """sums (n, 5) += kinetic energy, that of the change of the linear velocities to `free` (owned, 6), mass and number of
-    the own bodies, which are the first rows, at their roots. The spin has the greatest of the moments of a body."""
+    """sums (n, 5) += kinetic energy, that of the change of the linear velocities to `free` (owned, 6), mass and number
+    of the own bodies, which are the first rows, at their roots. The spin has the greatest of the moments of a body."""
     for n in range(len(free)):
         if moves[n]:
             moment, to = max(inertia[n, 0], inertia[n, 1], inertia[n, 2]), root[n]

@@ -28,7 +28,7 @@ from dem.compiled import loop
 from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
 from dem.contact_map.loops import closing, scale
-from dem.contact_map.mass import CellMass, JointedMass
+from dem.contact_map.mass import CellMass, ConstrainedMass
 from dem.contact_map.rows import packed
 from dem.free_motion import kept_spin
 from dem.model.world import World, turns_unlike_spheres
@@ -37,14 +37,8 @@ from dem.step.cohesion import along_normal, attraction
 from dem.step.rolling import resistance
 from dem.step.servo import cell_of
 from dem.step.surface import surface_velocities
-from dem.unconstrained import (
-    UnconstrainedMotion,
-    free_velocities,
-    joint_coupling,
-    joints_refound,
-    large_velocity,
-    slots,
-)
+from dem.unconstrained import UnconstrainedMotion, free_velocities, large_velocity
+from dem.unconstrained.constraints import coupling_of, coupling_refound, slots
 from dem.unconstrained.drives import Drives, free_directions
 
 #: Bodies that contacts turned by more radians in the last step were struck: those impulses do not come again.
@@ -58,7 +52,7 @@ class ContactSystem:
 
     Attributes, of nc local contacts and of the bodies whose rows this rank owns (`World.owned`):
         dt (float): step [s]
-        motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`, with the `push` and the joints of the step
+        motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`, with `push` and coupling of the step
         contacts: as the search found them
         key (nc,), mu (nc,), point (nc, 3): contact key, friction coefficient, contact point [m]
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
@@ -84,8 +78,8 @@ class ContactSystem:
         attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.step.cohesion`
         drives: of the large bodies, the same on all ranks
         at_once: how many contacts of this rank bounce with all others of the step, and not in their order
-        joints: the rows of joints, a `dem.parts.joints.Coupling`; None if there are none
-        applied: what loads and springs give, a `dem.unconstrained.applied.Applied`; None if there are none
+        coupling: by constraints, a `dem.unconstrained.constraints.Coupling`; None if there are none
+        applied: what parts give, a `dem.unconstrained.applied.Applied`; None if none do
     """
 
     def __init__(
@@ -106,7 +100,7 @@ class ContactSystem:
         self.attraction = attraction(world, contacts, dt)
         last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
         self.motion, change = self._linearised(world, motion, last)
-        self.joints = self.motion.joints
+        self.coupling = self.motion.coupling
         free, freely, rounding = self._free(world, change)
         self.free_velocity = free[:owned]
         self.free_large = free[near.grains + near.ghosts :]
@@ -154,7 +148,7 @@ class ContactSystem:
     def _linearised(
         self, world: World, motion: UnconstrainedMotion, last: Floats
     ) -> tuple[UnconstrainedMotion, Floats | None]:
-        """The motion with the joints, and with the push about which it is linear where bodies turn in other ways than
+        """The motion with constraints, and with the push about which it is linear where bodies turn in other ways than
         spheres, if it has none yet: that of the `last` impulses (nc, 3); and what the push changes of the velocities
         (owned, 6). Collective."""
         change, push = None, motion.push
@@ -165,29 +159,31 @@ class ContactSystem:
             scale(self.contact_map.given.root, push, change)
             struck = self.dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
             push[struck], change[struck] = 0.0, 0.0
-        joints = joint_coupling(world, motion, push) if motion.joints is None else motion.joints
-        return replace(motion, push=push, joints=joints), change
+        coupling = motion.coupling
+        if coupling is None:
+            coupling = coupling_of(world, motion.applied, motion.given, self.dt, push)
+        return replace(motion, push=push, coupling=coupling), change
 
     def _free(self, world: World, change: Floats | None) -> tuple[Floats, Floats, Floats]:
-        """Velocities (rows, 6) without contacts of the bodies of `near`, with joints, those of the contacts (nc, 3) and
-        their rounding (nc,); collective. Sets `middle` and the inverse mass of jointed bodies."""
+        """Velocities (rows, 6) without contacts of the bodies of `near`, with constraints, of contacts (nc, 3), and
+        their rounding (nc,); collective. Sets `middle` and the inverse mass of constrained bodies."""
         given, row, owned = self.contact_map.given, self.contact_map.body, world.owned
         free, self.middle = free_velocities(world, self.near, self.motion, change)
         if self.applied is not None or change is not None:
             self.contact_map.halo.update(free)
         freely, rounding = closing(given.frame, given.arm, row, free)
-        if self.joints is not None:
+        if self.coupling is not None:
             here, slot = slots(world, self.near.bodies.id)
-            spin = self.joints.spin[slot]
+            spin = self.coupling.spin[slot]
             free[here, 3:] = np.where(np.isnan(spin), free[here, 3:], spin)
-            free[here] += self.joints.change[slot]
+            free[here] += self.coupling.change[slot]
             if self.middle is not None:
-                self.middle[here[here < owned]] = self.joints.middle[slot[here < owned]]
+                self.middle[here[here < owned]] = self.coupling.middle[slot[here < owned]]
             freely, more = closing(given.frame, given.arm, row, free)
             rounding += more
             own = here < owned
-            jointed = JointedMass(world.comm, given.root, here[own], slot[own], self.joints.matrix)
-            self.contact_map = self.contact_map.with_mass(jointed)
+            mass = ConstrainedMass(world.comm, given.root, here[own], slot[own], self.coupling.matrix)
+            self.contact_map = self.contact_map.with_mass(mass)
         return free, freely, rounding
 
     def _bounce(
@@ -297,35 +293,35 @@ class ContactSystem:
         self.contact_map.comm.Allreduce(MPI.IN_PLACE, large)
         return large
 
-    def joint_impulses(self, impulse: Floats, moment: Floats | None = None) -> Floats:
-        """Impulses (k,) of the rows of joints with these impulses and moments of contacts (nc, 3) [N s, N m s];
+    def constraint_impulses(self, impulse: Floats, moment: Floats | None = None) -> Floats:
+        """Impulses (k,) of the rows of constraints with these impulses and moments of contacts (nc, 3) [N s, N m s];
         collective."""
-        if self.joints is None:
+        if self.coupling is None:
             return np.zeros(0)
-        return self.joints.impulses(self._push(impulse, moment))
+        return self.coupling.impulses(self._push(impulse, moment))
 
     def refound(self, world: World, impulse: Floats, velocity: Floats) -> UnconstrainedMotion | None:
-        """The motion with other joints and drives, where the impulses (parts nc, 3) of the cone problem and the
+        """The motion with other conditions and drives, where the impulses (parts nc, 3) of the cone problem and the
         velocities (owned, 6) show that other limits and motors hold, or that drives are too weak; else None.
         Collective."""
-        known, joints, spent = self.motion, None, None
-        if self.joints is not None and self.joints.decides:
-            joints = joints_refound(world, self.joints, self._push(*self.parts(impulse)))
+        known, coupling, spent = self.motion, None, None
+        if self.coupling is not None and self.coupling.decides:
+            coupling = coupling_refound(world, self.coupling, self._push(*self.parts(impulse)))
         if self.drives.most.any():
             large = large_velocity(world, known, velocity)
             spent = self.drives.refound(self.drive_impulse(large), large)
-        if joints is None and spent is None:
+        if coupling is None and spent is None:
             return None
-        known = known if joints is None else replace(known, joints=joints)
+        known = known if coupling is None else replace(known, coupling=coupling)
         return known if spent is None else known.with_spent(world, spent)
 
     def _push(self, impulse: Floats, moment: Floats | None) -> Floats:
-        """What contacts alone give the jointed bodies (n, 6), mass-scaled."""
+        """What contacts alone give the constrained bodies (n, 6), mass-scaled."""
         return self.problem_map.shared(impulse if moment is None else np.concatenate([impulse, moment]))
 
     def drive_impulse(self, large: Floats) -> Floats:
-        """Impulses and angular impulses (large, 6) of the drives and loads of large bodies that have the velocities
-        `large` (large, 6) after the step."""
+        """Impulses and angular impulses (large, 6) of the drives of large bodies, and of parts on them, that have the
+        velocities `large` (large, 6) after the step."""
         line, slip = self.drives.line, self.free_large - large
         return self.drives.impulse + (self.drives.grip * np.einsum("bi,bi->b", line, slip))[:, None] * line
 

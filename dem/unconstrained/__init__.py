@@ -1,7 +1,7 @@
-"""The motion of the bodies over a step without contacts: gravity, spin, loads, springs, drives, prescribed motions.
+"""The motion of the bodies over a step without contacts: gravity, spin, forces of parts, drives, prescribed motions.
 
 It is found once, at the start of a step, and handed on: the search for contacts, the contact problem, the advance and
-the record take what they need from it. No other part of a step asks motions, loads or springs.
+the record take what they need from it. Nothing else of a step asks motions and forces.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from mpi4py import MPI
 
 from dem import bodies
 from dem.arrays import Floats, Ints
@@ -19,9 +18,9 @@ from dem.free_motion import fallen, free_spin, free_velocity, gyroscopic, veloci
 from dem.model.neighbourhood import Neighbourhood
 from dem.model.world import World
 from dem.motion import Pose
-from dem.parts import joints
 from dem.together import together
-from dem.unconstrained.applied import Applied, applied_impulses, ends_of, row_of
+from dem.unconstrained.applied import Applied, applied_impulses
+from dem.unconstrained.constraints import Coupling
 from dem.unconstrained.drives import Drives, drives_of, given_velocities
 
 
@@ -34,13 +33,13 @@ class UnconstrainedMotion:
     #: (large, 6) mean velocities that motions give, see `dem.unconstrained.drives.given_velocities` [m/s, rad/s]
     given: Floats
     prescribed: Floats  #: (large, 6) of prescribed motions the same; other bodies keep theirs
-    applied: Applied | None  #: what loads and springs give; None without any
+    applied: Applied | None  #: what parts give; None without any
     drives: Drives  #: of the large bodies, the same on all ranks
     grains: Floats  #: (grains, 6) velocities of this rank's grains [m/s, rad/s]
     #: (owned, 6) mass-scaled momenta that contacts are expected to give, about which bodies that are no spheres and
-    #: joints are linearised; None until contacts are known, and if all bodies turn as spheres do
+    #: constraints are linearised; None until contacts are known, and if all bodies turn as spheres do
     push: Floats | None = None
-    joints: joints.Coupling | None = None  #: with that push, and with what contacts have shown of them; likewise None
+    coupling: Coupling | None = None  #: by constraints, with that push, and what contacts have shown; likewise None
 
     def with_spent(self, world: World, spent: Ints) -> UnconstrainedMotion:
         """The same with drives that give all their strength, see `Drives.spent`; collective."""
@@ -48,8 +47,8 @@ class UnconstrainedMotion:
 
 
 def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
-    """The motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a load fails, or
-    if dt is too large for the springs."""
+    """The motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a part
+    fails."""
     positive("time step", dt)
     poses = world.poses(world.time + dt)
     given, moves = given_velocities(world, poses, dt), bodies.is_dynamic(world.large)
@@ -107,58 +106,3 @@ def free_velocities(
     spin, middle[rows] = free_spin(*now, free.dt, (given + change[:, 3:])[rows])
     velocity[rows, 3:] = spin + given[rows]
     return velocity, middle
-
-
-def jointed(world: World) -> tuple[Ints, Ints]:
-    """The ids of the grains of joints, in order, and the rows (joints, 2) of the ends of joints among these, the large
-    bodies and the world."""
-    ends = [end for joint in world.joints.values() for end in joint.ends]
-    ids = np.unique([end for end in ends if isinstance(end, int)]).astype(np.int64)
-    return ids, np.array([row_of(world, ids, end) for end in ends]).reshape(-1, 2)
-
-
-def joint_coupling(world: World, free: UnconstrainedMotion, push: Floats | None = None) -> joints.Coupling | None:
-    """The joints in the step; None without any. `push` (owned, 6): the mass-scaled momenta that contacts are expected
-    to give the bodies whose rows this rank owns. Collective."""
-    if not world.joints:
-        return None
-    ids, row = jointed(world)
-    grains, large = np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity)
-    if free.applied is not None:
-        grains, large = free.applied.grains, free.applied.large
-    table = ends_of(world, ids, grains, large, free.given, free.dt)
-    gathered = np.zeros_like(table.free)
-    if push is not None:
-        id = np.concatenate([world.grains.id, world.large.id])[: len(push)]
-        here, slot = slots(world, id)
-        gathered[slot] = push[here]
-        world.comm.Allreduce(MPI.IN_PLACE, gathered)
-    given = list(world.joints.values()), row, table, free.dt, world.cell, gathered
-    found = joints.coupling(*given) if world.comm.rank == 0 else None
-    return world.comm.bcast(found)  # processors may round in other ways
-
-
-def joints_refound(world: World, known: joints.Coupling, push: Floats) -> joints.Coupling | None:
-    """`dem.parts.joints.refound`, by the first rank for all; collective."""
-    found = joints.refound(known, push) if world.comm.rank == 0 else None
-    return world.comm.bcast(found)
-
-
-def slots(world: World, id: Ints) -> tuple[Ints, Ints]:
-    """Which rows of bodies with these ids (n,) are among the bodies that joints know, and their rows there."""
-    ids, first = jointed(world)[0], world.first_large
-    here = np.flatnonzero(np.isin(id, ids) | (id >= first))
-    return here, np.where(id[here] >= first, len(ids) + id[here] - first, np.searchsorted(ids, id[here]))
-
-
-def joints_now(world: World) -> tuple[joints.Geometry, Floats]:
-    """The joints as they are, and the velocities (joints, 2, 6) of their ends; collective."""
-    (ids, row), grains, large = jointed(world), world.grains, world.large
-    here = np.flatnonzero(np.isin(grains.id, ids))
-    own, gathered = grains.take(here), np.zeros((len(ids), 13))
-    gathered[np.searchsorted(ids, own.id)] = np.concatenate([own.position, own.quaternion, own.velocity], axis=1)
-    world.comm.Allreduce(MPI.IN_PLACE, gathered)  # each row is that of one rank
-    tools = np.concatenate([large.position, large.quaternion, large.velocity], axis=1)
-    rest = np.concatenate([np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], np.zeros((1, 6))], axis=1)
-    position, turn, velocity = np.split(np.concatenate([gathered, tools, rest]), [3, 7], axis=1)
-    return joints.geometry(list(world.joints.values()), row, position, turn, world.cell), velocity[row]

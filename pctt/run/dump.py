@@ -26,7 +26,8 @@ from dem.exchange import offsets
 from dem.experiment import Experiment
 from dem.model.world import World
 from dem.parts.contact_law import ContactLaw
-from dem.parts.joints import Joint
+from dem.parts.ends import Constraint
+from dem.scene import kinds_of
 from dem.step.system import ContactSystem
 from pctt import ccp
 from pctt.ccp import fclib
@@ -51,7 +52,7 @@ class Dump:
     ):  # fmt: skip
         self._settings, self._experiment, self._world, self._place = settings, experiment, world, place
         self._hard_left, self._folder = hard, folder
-        self._none = unwritten(world.pairs, world.joints, world.cell.deforms)
+        self._none = unwritten(world.pairs, world.named, world.cell.deforms)
         if folder and self._none:
             raise OptionError(f"-dump_problem: {self._none}")
 
@@ -131,14 +132,15 @@ class Dump:
         return path
 
 
-def unwritten(pairs: ContactLaw, joints: dict[str, Joint], deforms: bool) -> str:
-    """Why problems of a scene with these pairs and joints, or whose cell `deforms`, cannot be written, in words; "" if
+def unwritten(pairs: ContactLaw, named: dict[str, dict[str, Any]], deforms: bool) -> str:
+    """Why problems of a scene with these pairs and parts, or whose cell `deforms`, cannot be written, in words; "" if
     they can."""
     if pairs.resists:  # FCLIB's files have a format of their own for these
         return "files have no rolling and spinning; allowed are scenes without them"
     if deforms:
         return "files have no cells that deform; allowed are scenes without them"
-    return "files have no joints; allowed are scenes without them" if joints else ""
+    kinds = [kind for kind, *_ in kinds_of(Constraint, named)]
+    return f"files have no {kinds[0]}s; allowed are scenes without them" if kinds else ""
 
 
 def masses_and_map(system: ContactSystem) -> tuple[np.ndarray, Array, ContactMap]:

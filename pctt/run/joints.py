@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from dem.arrays import Floats
-from dem.parts.joints import HOLDS, Geometry, Joint
+from dem.parts.ends import Geometry
+from dem.parts.joints import KINDS, Joint
 from dem.together import meet
-from dem.unconstrained import joints_now
+from dem.unconstrained.constraints import constraints_now, number_of
 
 
 class JointNow:
@@ -18,18 +19,18 @@ class JointNow:
     __slots__ = ("_number", "_sim", "name")
 
     def __init__(self, sim: Any, name: str):
-        if name not in sim.world.joints:
-            raise ValueError(f"no joint {name!r}; there are: {', '.join(sim.world.joints) or 'none'}")
-        self._sim, self.name = sim, name
-        self._number = list(sim.world.joints).index(name)
+        there = sim.world.named["joint"]
+        if name not in there:
+            raise ValueError(f"no joint {name!r}; there are: {', '.join(there) or 'none'}")
+        self._sim, self.name, self._number = sim, name, number_of(sim.world, "joint", name)
 
     @property
     def _now(self) -> tuple[Joint, Geometry, Floats]:
         """The joint, the geometry of all, and the velocities (6,) of its second end relative to the first."""
         meet(self._sim.comm, f"joint {self.name}")
-        found, velocity = joints_now(self._sim.world)
+        found, velocity = constraints_now(self._sim.world)
         relative = np.einsum("wsx,sx->w", found.rows[self._number], velocity[self._number])
-        return self._sim.world.joints[self.name], found, relative
+        return self.motor, found, relative
 
     @property
     def force(self) -> Floats:
@@ -44,18 +45,23 @@ class JointNow:
     @property
     def drive(self) -> float:
         """Torque [N m] or force [N] of the motor and the limits along the axis, its mean over the last step."""
-        joint = self._sim.world.joints[self.name]
-        return 0.0 if all(HOLDS[joint.kind]) else float(self._impulses[joint.way] / self._sim.settings.dt)
+        joint = self.motor
+        return float(self._impulses[joint.way] / self._sim.settings.dt) if KINDS[joint.kind].motor else 0.0
 
     @property
     def angle(self) -> float:
         """Angle of a hinge, between -pi and pi [rad]."""
-        return self._coordinate("hinge")
+        return float(self._free("hinge")[0])
+
+    @property
+    def angles(self) -> Floats:
+        """Angles (2,) of a universal joint about the axes of the first and of the second body [rad]."""
+        return self._free("universal")[::-1]
 
     @property
     def position(self) -> float:
         """Way of a slider [m]."""
-        return self._coordinate("slider")
+        return float(self._free("slider")[0])
 
     @property
     def speed(self) -> float:
@@ -67,24 +73,26 @@ class JointNow:
     def motor(self) -> Joint:
         """The ``speed``, ``target``, ``strength``, ``low`` and ``high`` of the motor and the limits, to read; not
         collective."""
-        joint: Joint = self._sim.world.joints[self.name]
+        joint: Joint = self._sim.world.named["joint"][self.name]
         return joint
 
-    def _coordinate(self, kind: str) -> float:
+    def _free(self, kind: str) -> Floats:
+        """The free coordinates of a joint of this kind."""
         joint, found, _ = self._now
         if joint.kind != kind:
             raise ValueError(f"joint {self.name!r} is a {joint.kind}, and no {kind}")
-        return float(found.error[self._number, joint.way])
+        free: Floats = found.error[self._number, np.logical_not(KINDS[kind].holds)]
+        return free
 
     @property
     def _impulses(self) -> Floats:
         """Impulses (6,) of the last step, along and about the axes of the joint as it was at its start."""
         step = self._sim._last
-        found, out = step.system.joints, np.zeros(6)
-        rows = np.flatnonzero(found.joint == self._number)
-        np.add.at(out, found.way[rows], step.joint_impulses[rows])
+        found, out = step.system.coupling, np.zeros(6)
+        rows = np.flatnonzero(found.part == self._number)
+        np.add.at(out, found.way[rows], step.constraint_impulses[rows])
         return out
 
     def _mean(self, part: slice) -> Floats:
-        axes: Floats = self._sim._last.system.joints.axes[self._number]
+        axes: Floats = self._sim._last.system.coupling.axes[self._number]
         return self._impulses[part] @ axes / self._sim.settings.dt

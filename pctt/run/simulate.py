@@ -38,7 +38,7 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
         progress.say("no options: the demo; -help lists the options")
     if run.dump_problem:
         scene = built(options.scene, comm)
-        if why := unwritten(scene.pairs(np.inf), scene.joints, scene.cell.deforms):
+        if why := unwritten(scene.pairs(np.inf), scene.named, scene.cell.deforms):
             raise OptionError(f"-dump_problem: {why}")
     compare = ccp.Comparison(comm, run.compared(), run.compare_every)
     with Simulation(

@@ -67,17 +67,23 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     """What a scene is made of, in words and numbers, for `unlike`."""
     large = scene.large_bodies
     motions = [(body.name, type(body.motion).__name__) for body in large]
-    words: list[Any] = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
-    words.append(repr(scene.passages))
+    words: list[Any] = [scene.materials, sorted(scene.leaving), motions, repr(scene.passages)]
     words.append([(part.count, part.kind, part.material) for part in scene.parts])
-    words.append([(name, repr(joint)) for name, joint in scene.joints.items()])
+    named = [(kind, name, vars(part)) for kind, there in scene.named.items() for name, part in there.items()]
+    words += [(kind, name, [repr(each) for each in given.values() if not _numeric(each) and not callable(each)])
+              for kind, name, given in named]  # fmt: skip
     numbers: list[Any] = [column.sample() for part in scene.parts for column in part.given.values()]
     numbers += scene.large().columns().values()
     numbers += [value for body in large for shape in body.shapes for value in placed(shape)]
     numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values(), *(body.surface for body in large)]
-    for part in (scene.cell, *(body.motion for body in large), *scene.springs.values(), *scene.loads.values()):
-        numbers += getattr(part, "__dict__", {}).values()
-    return repr(words), [value for value in map(np.asarray, numbers) if value.dtype.kind in "fiub"]
+    motion = [getattr(body.motion, "__dict__", {}) for body in large]
+    for values in (vars(scene.cell), *motion, *(given for *_, given in named)):
+        numbers += values.values()
+    return repr(words), [np.asarray(value) for value in numbers if _numeric(value)]
+
+
+def _numeric(value: Any) -> bool:
+    return np.asarray(value).dtype.kind in "fiub"
 
 
 def world_at_start(experiment: Experiment, scene: Scene, comm: MPI.Comm) -> World:

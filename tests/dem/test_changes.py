@@ -42,7 +42,7 @@ CHANGES = {
 
 
 def all_of(world):
-    parts = [world.loads, world.springs, world.joints, world.passages.sources, {b.name: b for b in world.large_bodies}]
+    parts = [*world.named.values(), {b.name: b for b in world.large_bodies}]
     return repr([vars(part) for named in parts for part in named.values()])
 
 
@@ -52,17 +52,16 @@ def test_what_is_changed_is_kept_and_restored():
         before = all_of(world)
         change(world, what, **values)
         assert all_of(world) != before, what
-    assert world.joints["axle"].speed is None  # a target takes its place
+    assert world.named["joint"]["axle"].speed is None  # a target takes its place
     kept = changes(world)
     assert {(kind, name) for kind, names in json.loads(kept).items() for name in names} == world.changed
     restore(again, kept)
     for name in ("wind", "drag", "tug"):
-        np.testing.assert_array_equal(again.loads[name].torque, world.loads[name].torque)
-    assert callable(again.loads["drag"].force)  # a law is the scene's
+        np.testing.assert_array_equal(again.named["load"][name].torque, world.named["load"][name].torque)
+    assert callable(again.named["load"]["drag"].force)  # a law is the scene's
     assert changes(again) == kept
-    assert again.springs == world.springs
-    assert again.joints == world.joints
-    assert again.passages.sources == world.passages.sources
+    for kind in ("spring", "joint", "source"):
+        assert again.named[kind] == world.named[kind]
     assert again.large_bodies[1].motion == Glide((1, 0, 0))
 
 

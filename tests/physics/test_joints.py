@@ -549,3 +549,71 @@ def test_no_shape_of_a_joined_body_touches_the_other_body():
     sim = pctt.Simulation(scene, dt=0.005, solver="apgd", tol=1e-6, comm=MPI.COMM_SELF)
     sim.run(steps=2)
     assert len(sim.last.contacts) == 0
+
+
+def shafts(bend, moment, torque=0.0):
+    """A motor turns the first of two shafts of a moment of inertia with 2 rad/s, and a torque brakes the second one,
+    whose axis is bent by an angle; both, and these axes."""
+    one, two = np.array([0.0, 0.0, 1.0]), np.array([np.sin(bend), 0.0, np.cos(bend)])
+    scene = Scene(friction=0.3, gravity=(0, 0, 0))
+    shaft = {"mass": 1.0, "inertia": (moment,) * 3}
+    scene.add_body("in", [Box((0.05, 0.05, 0.2))], Dynamic(), position=-0.5 * one, **shaft)
+    scene.add_body("out", [Box((0.05, 0.05, 0.2))], Dynamic(), position=0.5 * two, **shaft)
+    scene.add_joint("motor", None, "in", anchor=-0.5 * one, axis=one, speed=2.0)
+    scene.add_joint("bearing", None, "out", anchor=0.5 * two, axis=two)
+    pins = [(0, 1, 0), np.cross(two, (0, 1, 0))]
+    scene.add_joint("cross", "in", "out", kind="universal", anchor=(0, 0, 0), axis=pins)
+    scene.add_load("brake", on="out", torque=-torque * two)
+    return simulation(scene, 0.01)
+
+
+@pytest.mark.parametrize("bend", [0.4, 1.1])
+def test_a_universal_joint_turns_shafts_as_cardan_says(bend):
+    """tan(out) = tan(in) cos(bend) and M_in d in = M_out d out, of shafts without inertia."""
+    sim = shafts(bend, 1e-5, torque=3.0)
+    angles = []
+
+    sim.run(until=1.2, every=10, call=lambda sim: angles.append([sim.joint(x).angle for x in ("motor", "bearing")]))
+    a, b = np.transpose(angles)
+    np.testing.assert_allclose(np.cos(a) * np.sin(b), np.sin(a) * np.cos(bend) * np.cos(b), atol=1e-7)
+    assert np.all(np.cos(a - b) > 0.0)
+    assert np.ptp(a) > 2.0
+    begin = a[-1] - 0.01 * 2.0  # of the last step, whose forces are those of its start
+    slope = np.cos(bend) / (1.0 - (np.sin(begin) * np.sin(bend)) ** 2)
+    assert sim.joint("motor").drive == pytest.approx(3.0 * slope, rel=1e-3)
+
+
+def test_a_motor_pays_for_what_comes_out_of_a_universal_joint():
+    sim = shafts(0.7, 0.02, torque=1.5)
+    work = []
+    sim.step()
+    energy, angle = sim.kinetic_energy, sim.joint("bearing").angle
+    sim.run(until=0.8, call=lambda sim: work.append(sim.joint("motor").drive * 2.0 * sim.settings.dt))
+    left = sim.kinetic_energy - energy + 1.5 * (sim.joint("bearing").angle - angle)
+    assert left > 1.5
+    assert sum(work) == pytest.approx(left, rel=0.01)
+
+
+@pytest.mark.parametrize(("spin", "angles"), [((0, 3, 0), (0.6, 0)), ((1.5, 0, 0), (0, 0.3)), ((0, 0, 2), (0, 0))])
+def test_a_universal_joint_leaves_the_turns_about_its_axes(spin, angles):
+    scene = Scene(friction=0.3, gravity=(0, 0, 0))
+    motion = {"mass": 1.0, "inertia": (0.1, 0.1, 0.1), "angular_velocity": spin}
+    scene.add_body("bob", [Box((0.1, 0.1, 0.1))], Dynamic(), **motion)
+    scene.add_joint("cross", None, "bob", kind="universal", anchor=(0, 0, 0), axis=[(0, 2, 0), (1, 0, 0)])
+    sim = simulation(scene, 0.01)
+    sim.run(until=0.2)
+    np.testing.assert_allclose(sim.joint("cross").angles, angles, atol=1e-7)
+
+
+@pytest.mark.parametrize(("kind", "axis", "words"), [
+    ("universal", (0, 0, 1), "axes of 'j': got 1, allowed are 2 of a universal joint"),
+    ("hinge", [(0, 0, 1), (1, 0, 0)], "axes of 'j': got 2, allowed are 1 of a hinge joint"),
+    ("universal", [(0, 0, 1), (1, 0, 1)], "axes of 'j': allowed are perpendicular ones"),
+    ("universal", [(0, 0, 1), (0, 0, 0)], "axis of 'j' is the zero vector"),
+    ("cardan", (0, 0, 1), "kind of a joint 'cardan': allowed are hinge, .*, universal"),
+])  # fmt: skip
+def test_axes_that_a_joint_cannot_have(kind, axis, words):
+    scene = Scene(friction=0.3)
+    scene.add_spheres([0, 0, 0], 0.1, 1000.0)
+    with pytest.raises(ValueError, match=words):
+        scene.add_joint("j", None, 0, kind=kind, anchor=(0, 0, 0), axis=axis)

@@ -1,0 +1,268 @@
+"""Constraints of the bodies of a world in a step, such as joints: what they do without contacts, and to these.
+
+Constraints have rows J of the velocities of their bodies. In a step with the free velocities v* the velocity is
+
+    v = v* + M^-1 J' g,    J v + e (g - f) = t,
+
+with t for what is held such that its error is gone at the end of the step, see `coupling`.
+Motors have t = their speed. Their e is 0 if nothing bounds them. A bounded one gives the impulse f which brings it to
+its speed without contacts, within its strength, and e as `dem.motion.Driven` has its grip. Contacts see constraints in
+the inverse mass (`dem.contact_map.mass`), so they are solved together. Which limits are reached and which motors are
+too weak is found without contacts first (`coupling`). Where the contacts of the step show another set, they are solved
+once more with it (`refound`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from dem import quaternion
+from dem.arrays import Bools, Floats, Ints
+from dem.free_motion import free_spin, unequal
+from dem.model.world import World
+from dem.motion import DROOP
+from dem.parts.cell import Cell
+from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Constraint, Ends, Geometry
+from dem.scene import kinds_of
+from dem.unconstrained.applied import Applied, ends_of, rows_of
+
+Kinds = Sequence[tuple[type[Constraint], Sequence[Constraint]]]
+
+ROUNDS = 8  #: of the iteration for what is not linear in the velocities, at most
+FAR = 0.5  #: radians in a step above which it does not converge, and the step takes constraints as linear
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """The conditions of the constraints of a step, and what they do to n bodies without contacts."""
+
+    rows: Floats  #: (k, n, 6) J
+    scaled: Floats  #: (k, 6 n) B = J M^-1/2
+    root: Floats  #: (n, 6, 6) M^-1/2
+    part: Ints  #: (k,) of which constraint each row is
+    way: Ints  #: (k,) which of its six coordinates
+    kind: Ints  #: (k,) HELD, MOTOR, LOWER or UPPER
+    target: Floats  #: (k,) t
+    bound: Floats  #: (k,) greatest impulses, inf: none
+    free: Floats  #: (k,) J v*
+    slip: Floats  #: (k,) what bounded motors lose to the load that they can just bear
+    axes: Floats  #: (constraints, 3, 3) rows x, y, z in the world
+    on: Bools  #: (k,) the rows that hold
+    given: Floats  #: (k,) impulses of the others: of motors that are too weak
+    solver: Floats  #: (k, k) (B B' + e)^-1 of the rows that hold
+    impulse: Floats  #: (k,) without contacts [N s, N m s]
+    change: Floats  #: (n, 6) of velocities, by these impulses
+    matrix: Floats  #: (6 n, 6 n) K of `dem.contact_map.mass`
+    spin: Floats  #: (n, 3) angular velocities without all of that; NaN where all moments are equal, or infinite
+    middle: Floats  #: (n, 3) about which they are linear in the impulses, see `dem.free_motion.free_spin`
+
+    def impulses(self, push: Floats) -> Floats:
+        """Impulses (k,) of the rows where contacts give the bodies the mass-scaled momenta `push` (n, 6)."""
+        return self.impulse - self.solver @ (self.scaled @ push.ravel())
+
+    @property
+    def decides(self) -> bool:
+        """Whether contacts may change which rows hold: those of limits and of motors with a bound."""
+        return bool(((self.kind > MOTOR) | np.isfinite(self.bound)).any())
+
+
+def _geometry(parts: Kinds, row: Ints, position: Floats, turn: Floats, cell: Cell) -> Geometry:
+    """Of the constraints of all kinds, see `Constraint.geometry`."""
+    ends = np.cumsum([0, *(len(members) for _, members in parts)])
+    rows = [row[first:end] for first, end in zip(ends, ends[1:])]
+    found = [kind.geometry(members, own, position, turn, cell) for (kind, members), own in zip(parts, rows)]
+    return Geometry(*(np.concatenate(each) for each in zip(*found)))
+
+
+def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> Coupling:
+    """Of constraints, by kind, between these ends in a step of dt [s], in a cell, where contacts are
+    expected to give the bodies the mass-scaled momenta `push` (n, 6).
+
+    Motors that are too weak, and limits that are reached, are found without contacts, by an active set. What is not
+    linear is found by a fixed-point iteration, whose error falls by about the angle of a step each time: the angular
+    momentum of bodies that are no spheres, and the errors of constraints at the end of the step. So they hold there, as
+    in the method SHAKE, with forces of the start of the step, and energy does not drift (Hairer, Lubich, Wanner,
+    "Geometric Numerical Integration", section VII.1.4)."""
+    row, found = ends.row, _geometry(parts, ends.row, ends.position, ends.quaternion, cell)
+    count, every = len(ends.free), [part for _, members in parts for part in members]
+    asked = [(n, *each) for n, part in enumerate(every) for each in part.conditions(found.error[n], dt)]
+    which, ways, kind, t, bound = (np.array(column) for column in zip(*asked))
+    J = np.zeros((len(t), count, 6))
+    for side in (0, 1):
+        np.add.at(J, (np.arange(len(t)), row[which, side]), found.rows[which, ways, side])
+    root = _roots(ends.inverse_mass)
+    B = np.einsum("knx,nxy->kny", J, root).reshape(len(t), -1)
+    now, velocity = J.reshape(len(t), -1) @ ends.velocity.ravel(), ends.free.copy()
+    A = B @ B.T
+    slip = np.maximum(DROOP * np.abs(t), np.abs(t - now))
+    motors = np.isfinite(bound)
+    slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
+    on, given = kind <= MOTOR, np.zeros(len(t))
+    rows = np.flatnonzero(unequal(ends.moments))
+    known = ends.quaternion[rows], ends.velocity[rows, 3:], ends.moments[rows]
+    spin, middle = np.full((2, count, 3), np.nan)
+    held, left = kind == HELD, t.copy()
+    expected, pushed = push.ravel(), B @ push.ravel()
+    for _ in range(ROUNDS):
+        change = np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
+        alone, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.given[rows])
+        spin[rows] = velocity[rows, 3:] = alone + ends.given[rows]
+        free = J.reshape(len(t), -1) @ velocity.ravel()
+        for _ in range(2 * len(t) + 1):
+            g = _impulses(A, t, free, on, given)
+            wrong = _wrong(kind, t, bound, on, g, free + A @ g, 0.0)
+            if not wrong.any():
+                break
+            on, given = _turned(kind, bound, on, given, g, wrong)
+        last, expected = expected, B.T @ g
+        if pushed.any():
+            expected = push.ravel() + B.T @ _impulses(A, t, free + pushed, on, given)
+        if np.abs(expected - last).max() <= 1e-7 * np.abs(expected).max():
+            break
+        after = velocity + np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
+        if dt * np.abs(after[:, 3:]).max(initial=0.0) > FAR:
+            break
+        place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after[:, 3:], dt)
+        error = _geometry(parts, row, place, turn, cell).error
+        bent = (error - found.error)[which, ways] / dt - J.reshape(len(t), -1) @ after.ravel()
+        t = np.where(held, left - bent, left)
+    fixed = (J, B, root, which, ways, kind, t, bound, free, slip, found.axes)
+    return Coupling(*fixed, on, given, *_solved(B, root, t, bound, free, slip, on, given), spin=spin, middle=middle)
+
+
+def refound(known: Coupling, push: Floats) -> Coupling | None:
+    """The coupling with other rows that hold, where contacts give the bodies the mass-scaled momenta `push` (n, 6) with
+    the known one and show by it that a limit is passed or pulls, or that a motor is too weak, or strong enough. None if
+    all rows are right; the contacts of the other one are to be solved anew."""
+    g = known.impulses(push)
+    after = known.free + known.scaled @ (push.ravel() + known.scaled.T @ g)
+    wrong = _wrong(known.kind, known.target, known.bound, known.on, g, after, DROOP)
+    if not wrong.any():
+        return None
+    on, given = _turned(known.kind, known.bound, known.on, known.given, g, wrong)
+    numbers = known.target, known.bound, known.free, known.slip
+    solver, impulse, change, matrix = _solved(known.scaled, known.root, *numbers, on, given)
+    return dataclasses.replace(
+        known, on=on, given=given, solver=solver, impulse=impulse, change=change, matrix=matrix
+    )
+
+
+def _impulses(A: Floats, t: Floats, free: Floats, on: Bools, given: Floats) -> Floats:
+    """Impulses (k,) that bring the rows that hold to t; of the others the given ones."""
+    g = given.copy()
+    g[on] = np.linalg.lstsq(A[np.ix_(on, on)], (t - free - A @ given)[on], rcond=1e-12)[0]
+    return g
+
+
+def _wrong(kind: Ints, t: Floats, bound: Floats, on: Bools, g: Floats, after: Floats, loose: float) -> Bools:
+    """Which rows (k,) should hold and do not, or the other way round, with impulses g and velocities `after`. Where
+    solvers are not exact, a part `loose` of the impulses does not count."""
+    little, speed = loose * np.abs(g).max(initial=0.0), 1e-12 + 1e-6 * loose * np.abs(after - t).max(initial=0.0)
+    weak = on & (kind == MOTOR) & (np.abs(g) > (1.0 + loose) * bound)
+    strong = ~on & (kind == MOTOR) & (np.sign(g) * (after - t) > speed)
+    reached = ~on & (((kind == LOWER) & (after < t - speed)) | ((kind == UPPER) & (after > t + speed)))
+    pulls = on & (((kind == LOWER) & (g < -little)) | ((kind == UPPER) & (g > little)))
+    wrong: Bools = weak | strong | reached | pulls
+    return wrong
+
+
+def _turned(kind: Ints, bound: Floats, on: Bools, given: Floats, g: Floats, wrong: Bools) -> tuple[Bools, Floats]:
+    """The rows that hold and the given impulses of the others, after the wrong ones have changed sides."""
+    given = given.copy()
+    given[wrong] = 0.0
+    weak = wrong & on & (kind == MOTOR)
+    given[weak] = np.sign(g[weak]) * bound[weak]
+    return on ^ wrong, given
+
+
+def _solved(
+    B: Floats, root: Floats, t: Floats, bound: Floats, free: Floats, slip: Floats, on: Bools, given: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """`solver`, `impulse`, `change` and `matrix` of a `Coupling`."""
+    A = B @ B.T
+    g = _impulses(A, t, free, on, given)
+    room = bound - np.abs(g)  # not positive where only contacts bring a motor to its speed: it is held there
+    yields = np.isfinite(bound) & (room > 0.0)
+    e = np.divide(slip, room, out=np.zeros_like(slip), where=yields)
+    solver = np.zeros_like(A)
+    solver[np.ix_(on, on)] = np.linalg.pinv(A[np.ix_(on, on)] + np.diag(e[on]), rcond=1e-12, hermitian=True)
+    value, vector = np.linalg.eigh(B.T @ solver @ B)
+    K = (vector * (1.0 - np.sqrt(np.clip(1.0 - value, 0.0, 1.0)))) @ vector.T
+    change = np.einsum("nxy,ny->nx", root, (B.T @ g).reshape(-1, 6))
+    return solver, g, change, K
+
+
+def _roots(matrix: Floats) -> Floats:
+    """Symmetric roots of symmetric matrices (n, 6, 6)."""
+    value, vector = np.linalg.eigh(matrix)
+    return (vector * np.sqrt(np.maximum(value, 0.0))[:, None]) @ vector.transpose(0, 2, 1)
+
+
+def constrained(world: World) -> tuple[Ints, Ints]:
+    """The ids of the grains at the ends of constraints, in order, and the rows (constraints, 2) of the ends among
+    these, the large bodies and the world."""
+    return rows_of(world, [part for _, members in _parts(world) for part in members])
+
+
+def _parts(world: World) -> Kinds:
+    return [(kind, [*members.values()]) for _, kind, members in kinds_of(Constraint, world.named)]
+
+
+def coupling_of(
+    world: World, applied: Applied | None, given: Floats, dt: float, push: Floats | None
+) -> Coupling | None:
+    """The constraints in the next step of dt [s] with what is applied, in which motions give the velocities `given`
+    (large, 6); None without any. `push` (owned, 6): the mass-scaled momenta that contacts are expected to give the
+    bodies whose rows this rank owns. Collective."""
+    parts = _parts(world)
+    if not parts:
+        return None
+    grains, large = np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity)
+    if applied is not None:
+        grains, large = applied.grains, applied.large
+    ends = ends_of(world, [part for _, members in parts for part in members], grains, large, given, dt)
+    gathered = np.zeros_like(ends.free)
+    if push is not None:
+        id = np.concatenate([world.grains.id, world.large.id])[: len(push)]
+        here, slot = slots(world, id)
+        gathered[slot] = push[here]
+        world.comm.Allreduce(MPI.IN_PLACE, gathered)
+    found = coupling(parts, ends, dt, world.cell, gathered) if world.comm.rank == 0 else None
+    return world.comm.bcast(found)  # processors may round in other ways
+
+
+def coupling_refound(world: World, known: Coupling, push: Floats) -> Coupling | None:
+    """`refound`, by the first rank for all; collective."""
+    found = refound(known, push) if world.comm.rank == 0 else None
+    return world.comm.bcast(found)
+
+
+def slots(world: World, id: Ints) -> tuple[Ints, Ints]:
+    """Which rows of bodies with these ids (n,) are among the bodies that constraints know, and their rows there."""
+    ids, first = constrained(world)[0], world.first_large
+    here = np.flatnonzero(np.isin(id, ids) | (id >= first))
+    return here, np.where(id[here] >= first, len(ids) + id[here] - first, np.searchsorted(ids, id[here]))
+
+
+def number_of(world: World, kind: str, name: str) -> int:
+    """The number of a constraint among all of them."""
+    names = [(each, own) for each, _, members in kinds_of(Constraint, world.named) for own in members]
+    return names.index((kind, name))
+
+
+def constraints_now(world: World) -> tuple[Geometry, Floats]:
+    """The constraints as they are, and the velocities (constraints, 2, 6) of their ends; collective."""
+    (ids, row), grains, large = constrained(world), world.grains, world.large
+    here = np.flatnonzero(np.isin(grains.id, ids))
+    own, gathered = grains.take(here), np.zeros((len(ids), 13))
+    gathered[np.searchsorted(ids, own.id)] = np.concatenate([own.position, own.quaternion, own.velocity], axis=1)
+    world.comm.Allreduce(MPI.IN_PLACE, gathered)  # each row is that of one rank
+    tools = np.concatenate([large.position, large.quaternion, large.velocity], axis=1)
+    rest = np.concatenate([np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], np.zeros((1, 6))], axis=1)
+    position, turn, velocity = np.split(np.concatenate([gathered, tools, rest]), [3, 7], axis=1)
+    return _geometry(_parts(world), row, position, turn, world.cell), velocity[row]
