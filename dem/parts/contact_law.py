@@ -11,12 +11,14 @@ import numpy as np
 from dem import checks
 from dem.arrays import Floats
 from dem.parts.laws import Law, Met, Solved
+from dem.parts.laws.bridges import Bridges
 from dem.parts.laws.cohesion import Cohesion
 from dem.parts.laws.rolling import Rolling
+from dem.parts.laws.static_friction import StaticFriction
 
 
 @dataclass(frozen=True)
-class ContactLaw(Rolling, Cohesion):
+class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
     """The coefficients of the contacts of two materials, or tables (materials, materials) of those of all pairs.
 
     Its methods sum up those of all laws, and `kept` (nc, columns) has a column of each that keeps something.

@@ -374,7 +374,7 @@ def contact_statistics(step: Step) -> dict[str, float]:
     (count, weight, push, size), _ = reduced(comm, (len(contacts), impulse[:, 0].sum(), push, size), ())
     grain = contacts.near.bodies.shape != COMPOUND
     least = 0.01 * weight / max(count, 1.0)
-    *sums, worst = counted(impulse, contacts.friction, contacts.gap, contacts.a, contacts.b, grain, least)
+    *sums, worst = counted(impulse, step.system.friction, contacts.gap, contacts.a, contacts.b, grain, least)
     sums, (worst,) = reduced(comm, [*sums, step.system.at_once], (max(worst, contacts.held_overlap),))
     bounces = {"impacts_at_once": sums[3]} if step.world.pairs.restitution.any() else {}
     return {

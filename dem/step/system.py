@@ -61,7 +61,8 @@ class ContactSystem:
         dt (float): step [s]
         motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`, with the `push` and the joints of the step
         contacts: as the search found them
-        key (nc,), mu (nc,), point (nc, 3): contact key, friction coefficient, contact point [m]
+        key (nc,), point (nc, 3): contact key, contact point [m]
+        friction (nc,), mu (nc,): friction coefficient, and that of the cones: zero in impacts that are `smooth`
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
@@ -114,9 +115,8 @@ class ContactSystem:
         self.met = met(world, contacts, dt, self._slip(contacts)) if world.pairs.acting else None
         pull = None if self.met is None else world.pairs.pull(self.met, self.past)
         self.attraction = None if pull is None else dt * pull
-        self.mu = contacts.friction
-        if self.met is not None:
-            self.mu = world.pairs.cone(self.met, self.past, self.mu)
+        self.mu = contacts.friction if self.met is None else world.pairs.cone(self.met, self.past, contacts.friction)
+        self.friction = self.mu
         last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
         self.motion, change = self._linearised(world, motion, last)
         self.joints = self.motion.joints
