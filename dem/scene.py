@@ -497,8 +497,7 @@ class Scene:
     @property
     def reach(self) -> float:
         """The greatest gap at which bodies attract each other [m]."""
-        found = self.pairs(np.inf)
-        return float(found.cohesion_range[found.cohesion > 0.0].max(initial=0.0))
+        return self.pairs(np.inf).reach()
 
     @property
     def states_stiffness(self) -> bool:

@@ -2,42 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, cast
 
 import numpy as np
 
 from dem import checks
-
-
-def _coefficient(check: Callable[[str, Any], Any], default: Any = MISSING) -> Any:
-    return field(default=default, metadata={"check": check})
+from dem.arrays import Floats
+from dem.parts.laws import Law, Met, Solved
+from dem.parts.laws.bridges import Bridges
+from dem.parts.laws.cohesion import Cohesion
+from dem.parts.laws.rolling import Rolling
+from dem.parts.laws.static_friction import StaticFriction
 
 
 @dataclass(frozen=True)
-class ContactLaw:
+class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
     """The coefficients of the contacts of two materials, or tables (materials, materials) of those of all pairs.
 
-    ValueError for a coefficient that fails its check, and for cohesion without a range.
+    Its methods sum up those of all laws, and `kept` (nc, columns) has a column of each that keeps something.
+    ValueError for a coefficient that fails its check, and for those that do not go together.
     """
-
-    friction: Any = _coefficient(checks.not_negative)  #: of Coulomb's law
-    stiffness: Any = _coefficient(checks.positive_or_inf, None)  #: inf: rigid; None: what the scene needs [N/m]
-    restitution: Any = _coefficient(checks.between(0.0, 1.0), 0.0)  #: of impacts
-    cohesion: Any = _coefficient(checks.not_negative, 0.0)  #: force with which bodies attract each other [N]
-    cohesion_range: Any = _coefficient(checks.not_negative, 0.0)  #: gap up to which they do [m]
-    rolling: Any = _coefficient(checks.not_negative, 0.0)  #: greatest moment against it, over the normal force [m]
-    spinning: Any = _coefficient(checks.not_negative, 0.0)  #: the same about the normal [m]
-    touching: Any = _coefficient(checks.between(0.0, 1.0), 1.0)  #: 0: the two never touch, and go through each other
 
     def __post_init__(self) -> None:
         for name, check in CHECKS.items():
             value = getattr(self, name)
             if not (value is None or isinstance(value, np.ndarray)):
                 check(name, value)
-        if np.any((np.asarray(self.cohesion) > 0.0) & (np.asarray(self.cohesion_range) == 0.0)):
-            raise ValueError("cohesion: needs a cohesion_range above zero, as touching bodies have gaps of about zero")
+        for law in LAWS:
+            law.refuse(self)
+
+    @property
+    def acting(self) -> list[type[Law]]:
+        """The laws that add something."""
+        return [law for law in LAWS if law.acts(self)]
 
     @property
     def parts(self) -> int:
@@ -45,11 +44,50 @@ class ContactLaw:
         return 2 if self.resists else 1
 
     @property
+    def columns(self) -> int:
+        """How many numbers of a contact laws keep beside its impulses."""
+        return sum(law.KEEPS for law in self.acting)
+
+    @property
     def resists(self) -> bool:
         """Whether contacts of any pair resist rolling or spinning."""
-        return bool(np.any(self.rolling) or np.any(self.spinning))
+        return self.moments() is not None
+
+    @property
+    def attracts(self) -> bool:
+        """Whether bodies of any pair attract each other."""
+        return bool(self.strongest(np.ones(1)) > 0.0)
+
+    def reach(self) -> float:
+        return max((law.reach(self) for law in self.acting), default=0.0)
+
+    def strongest(self, radius: Floats) -> Any:
+        return sum(law.strongest(self, radius) for law in self.acting)
+
+    def pull(self, met: Met, kept: Floats) -> Floats | None:
+        found = [law.pull(self, met, column) for law, column in self._each(kept)]
+        pulls = [pull for pull in found if pull is not None]
+        return np.sum(pulls, axis=0) if pulls else None
+
+    def cone(self, met: Met, kept: Floats, friction: Floats) -> Floats:
+        for law, column in self._each(kept):
+            friction = law.cone(self, met, column, friction)
+        return friction
+
+    def moments(self) -> tuple[Floats, Floats] | None:
+        return next((found for law in LAWS if (found := law.moments(self)) is not None), None)
+
+    def keep(self, met: Met, kept: Floats, solved: Solved) -> Floats:
+        found = [law.keep(self, met, column, solved) for law, column in self._each(kept) if law.KEEPS]
+        return np.stack(found, axis=1) if found else kept
+
+    def _each(self, kept: Floats) -> list[tuple[type[Law], Floats]]:
+        """The laws that act, each with its column of `kept`."""
+        columns = iter(kept.T)
+        return [(law, next(columns) if law.KEEPS else np.zeros(len(kept))) for law in self.acting]
 
 
+LAWS = cast("tuple[type[Law], ...]", ContactLaw.__bases__)
 CHECKS = {each.name: each.metadata["check"] for each in fields(ContactLaw)}
 
 

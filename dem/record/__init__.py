@@ -158,7 +158,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     mean = 0.5 * (velocity[first:] + world.large.velocity)
     normal, tangential, opening = works(step, step.in_cone, velocity, step.moment)
     elastic, elastic_at_end, strained, strained_at_end = spring_energies(step, velocity, opening)
-    cohesion = 0.0 if system.attraction is None else works(step, step.impulse, velocity)[0] - normal
+    attracted = 0.0 if system.attraction is None else works(step, step.impulse, velocity)[0] - normal
     applied = belts = flow = 0.0
     if system.applied is not None:
         applied = 0.5 * np.vdot(system.applied.grains, before[0].velocity + world.grains.velocity)
@@ -169,7 +169,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     whole = _summed(
         comm, kinetic_before=was[0], potential_before=was[1], kinetic=now[0], potential=now[1], normal=normal,
         tangential=tangential, elastic=elastic, elastic_at_end=elastic_at_end, strained=strained,
-        strained_at_end=strained_at_end, still=still, least=least, carried=_carried(step, ~moves), cohesion=cohesion,
+        strained_at_end=strained_at_end, still=still, least=least, carried=_carried(step, ~moves), attracted=attracted,
         applied=applied, belts=belts, flow=flow,
     )  # fmt: skip
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
@@ -179,7 +179,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     work = driving - np.vdot(step.impulse_on_large[~moves], mean[~moves])
     rise, fallen = whole["kinetic"] - whole["kinetic_before"], whole["potential_before"] - whole["potential"]
     held, bent = whole["elastic_at_end"] - whole["elastic"], whole["strained_at_end"] - whole["strained"]
-    pulled, released = 2.0 * max(whole["cohesion"], 0.0), max(-held, 0.0) + max(-bent, 0.0)
+    pulled, released = 2.0 * max(whole["attracted"], 0.0), max(-held, 0.0) + max(-bent, 0.0)
     pulled += max(held_at_end - held_by, 0.0)  # with the velocity of the end, for bodies that were at rest
     there = whole["kinetic_before"] + whole["still"] + whole["carried"]
     stored = whole["elastic"] + whole["strained"]
@@ -187,7 +187,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     driven = max(fallen, 0.0) + max(driving, 0.0) + pulled + released * (whole["carried"] == 0.0)
     jumps = rise > whole["least"] and (created or whole["kinetic"] - driven > SUDDEN * there + CREATED * driven)
     change = whole["kinetic"] + whole["potential"] - whole["kinetic_before"] - whole["potential_before"]
-    made = change - work - whole["normal"] - whole["tangential"] - whole["cohesion"] + whole["belts"]
+    made = change - work - whole["normal"] - whole["tangential"] - whole["attracted"] + whole["belts"]
     return {
         "kinetic_energy [J]": whole["kinetic"],
         "potential_energy [J]": whole["potential"],
@@ -196,7 +196,7 @@ def energy_balance(step: Step) -> dict[str, float]:
         "work_of_motions [J]": work,
         "friction_loss [J]": whole["belts"] - whole["tangential"] - bent,  # nothing is zero, not -0
         "impact_loss [J]": 0.0 - whole["normal"] - held,
-        **({} if system.attraction is None else {"work_of_cohesion [J]": whole["cohesion"]}),
+        **({} if system.attraction is None else {"work_of_cohesion [J]": whole["attracted"]}),
         "time_stepping [J]": made,
         "energy_jump [J]": comm.bcast(rise if jumps else 0.0),  # what follows from it must not differ between ranks
     }
@@ -351,7 +351,7 @@ def contact_statistics(step: Step) -> dict[str, float]:
     (count, weight, push, size), _ = reduced(comm, (len(contacts), impulse[:, 0].sum(), push, size), ())
     grain = contacts.near.bodies.shape != COMPOUND
     least = 0.01 * weight / max(count, 1.0)
-    *sums, worst = counted(impulse, contacts.friction, contacts.gap, contacts.a, contacts.b, grain, least)
+    *sums, worst = counted(impulse, step.system.friction, contacts.gap, contacts.a, contacts.b, grain, least)
     sums, (worst,) = reduced(comm, [*sums, step.system.at_once], (max(worst, contacts.held_overlap),))
     bounces = {"impacts_at_once": sums[3]} if step.world.pairs.restitution.any() else {}
     return {

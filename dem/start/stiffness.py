@@ -244,9 +244,8 @@ def _strongest(weight: Floats, thrown: Floats, pushed: Floats, single: float) ->
 
 def _load(scene: Scene, pressed: Pressing) -> Floats:
     """The weight that the whole bed, or the stress of the cell, would lay on each of the grains that stand for all, and
-    the strongest cohesion (n,) [N]."""
+    the strongest attraction (n,) [N]."""
     every, gravity = scene.expected(), math.hypot(*scene.gravity)
-    pull = scene.pairs(np.inf).cohesion.max()
     pressure = scene.cell.pressure
     if gravity > 0.0:
         down = np.asarray(scene.gravity) / gravity
@@ -255,7 +254,9 @@ def _load(scene: Scene, pressed: Pressing) -> Floats:
         sizes = [(float(np.linalg.norm(force)), force) for force in pressed.spread]
         pressure += sum(size / area(scene, force / size) for size, force in sizes if size > 0.0)
     radius = bodies.bounding_radius(every)
-    return np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * every.mass) + pull
+    pull = scene.pairs(np.inf).strongest(2.0 * radius)
+    load: Floats = np.maximum(CHAINS * pressure * (2.0 * radius) ** 2, gravity * every.mass) + pull
+    return load
 
 
 def _pressure(scene: Scene, gravity: float, down: Floats) -> float:

@@ -19,7 +19,7 @@ from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
 from dem.measures import Sample
 from dem.model.world import World
-from dem.step.cohesion import along_normal
+from dem.step.laws import along_normal
 from dem.step.system import ContactSystem, contact_arms, contact_frames, gap_velocities
 from dem.together import meet
 from dem.unconstrained import UnconstrainedMotion, large_velocity

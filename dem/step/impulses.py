@@ -19,21 +19,23 @@ class ImpulseMemory:
     meets on ranks that a hash of the key tells.
     """
 
-    def __init__(self, comm: MPI.Comm, parts: int = 1) -> None:
-        """`parts`: how often a contact has three numbers, see `ContactLaw.parts`."""
-        self._comm, self._parts = comm, parts
-        self.restore(np.zeros(0, np.complex128), np.zeros((0, 4 * parts)))
+    def __init__(self, comm: MPI.Comm, parts: int = 1, columns: int = 0) -> None:
+        """`parts`: how often a contact has three numbers; `columns`: how many others laws keep, see `ContactLaw`."""
+        self._comm, self._parts, self.width = comm, parts, 4 * parts + columns
+        self.restore(np.zeros(0, np.complex128), np.zeros((0, self.width)))
 
-    def remember(self, key: Keys, impulse: Floats, frame: Floats) -> None:
-        """Replace the memory by impulses (parts nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3)."""
+    def remember(self, key: Keys, impulse: Floats, frame: Floats, kept: Floats | None = None) -> None:
+        """Replace the memory by impulses (parts nc, 3) of contacts with keys (nc,) and frames (nc, 3, 3), and by what
+        laws `kept` (nc, columns) of them."""
         each = impulse.reshape(self._parts, len(key), 3)
         rows = [in_world(part, frame) for part in each]
-        self.restore(key, rows[0] if self._parts == 1 else np.concatenate(rows, axis=1))
+        rows += [] if kept is None else [kept]
+        self.restore(key, rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1))
 
-    def recall(self, key: Keys, frame: Floats, elsewhere: bool = True) -> tuple[Floats, Bools]:
-        """Impulses (parts nc, 3) in the given frames (nc, 3, 3), zero where unknown, and the mask (nc,) of those
-        known. `elsewhere`: whether other ranks may have stored them, as grains have changed their rank since; the same
-        on all ranks.
+    def recall(self, key: Keys, frame: Floats, elsewhere: bool = True) -> tuple[Floats, Bools, Floats]:
+        """Impulses (parts nc, 3) in the given frames (nc, 3, 3), zero where unknown, the mask (nc,) of those known, and
+        what laws kept (nc, columns). `elsewhere`: whether other ranks may have stored them, as grains have changed
+        their rank since; the same on all ranks.
 
         Collective."""
         place, stored = places(self._key, key), self._impulse
@@ -43,9 +45,12 @@ class ImpulseMemory:
             row, impulse = self._elsewhere(key[missing], self._key[left], self._impulse[left])
             place[missing[row]] = len(stored) + np.arange(len(row))
             stored = np.concatenate([stored, impulse])
-        each = [stored] if self._parts == 1 else np.split(stored, self._parts, axis=1)
+        ends = 4 * np.arange(1, self._parts + 1)
+        *each, columns = np.split(stored, ends, axis=1)
         found = [in_frames(np.ascontiguousarray(part), place, frame) for part in each]
-        return found[0] if self._parts == 1 else np.concatenate(found), place >= 0
+        kept = np.zeros((len(place), columns.shape[1]))
+        kept[place >= 0] = columns[place[place >= 0]]
+        return found[0] if self._parts == 1 else np.concatenate(found), place >= 0, kept
 
     def _elsewhere(self, asked: Keys, key: Keys, impulse: Floats) -> tuple[Ints, Floats]:
         """Which of the keys `asked` (m,) other ranks offer in their `key` (n,), and their impulses; collective."""
@@ -55,7 +60,7 @@ class ImpulseMemory:
             "key": both,
             "row": np.concatenate([np.arange(many), np.full(len(key), -1)]),  # -1: this one is offered
             "rank": np.full(len(both), comm.rank),
-            "impulse": np.concatenate([np.zeros((many, 4 * self._parts)), impulse]),
+            "impulse": np.concatenate([np.zeros((many, self.width)), impulse]),
         }
         met = exchange(comm, rows, homes(both, comm.size))
         offered, wanted = np.flatnonzero(met["row"] < 0), np.flatnonzero(met["row"] >= 0)
@@ -65,7 +70,8 @@ class ImpulseMemory:
         return answer["row"], answer["impulse"]
 
     def state(self) -> tuple[Keys, Floats]:
-        """Keys (n,) and impulses (n, 4 parts) (normal, tangential vector) that this rank stores, for `restore`."""
+        """Keys (n,) and rows (n, 4 parts + columns) that this rank stores, for `restore`: of each part the normal
+        impulse and the tangential vector, then what laws keep."""
         return self._key, self._impulse
 
     def restore(self, key: Keys, stored: Floats) -> None:

@@ -32,9 +32,10 @@ from dem.contact_map.mass import CellMass, ConstrainedMass
 from dem.contact_map.rows import packed
 from dem.free_motion import kept_spin
 from dem.model.world import World, turns_unlike_spheres
+from dem.parts.laws import Solved
 from dem.start import stiffness
-from dem.step.cohesion import along_normal, attraction
-from dem.step.rolling import resistance
+from dem.step.laws import along_normal, met
+from dem.step.resistance import resistance
 from dem.step.servo import cell_of
 from dem.step.surface import surface_velocities
 from dem.unconstrained import UnconstrainedMotion, free_velocities, large_velocity
@@ -54,7 +55,8 @@ class ContactSystem:
         dt (float): step [s]
         motion: without contacts, a `dem.unconstrained.UnconstrainedMotion`, with `push` and coupling of the step
         contacts: as the search found them
-        key (nc,), mu (nc,), point (nc, 3): contact key, friction coefficient, contact point [m]
+        key (nc,), point (nc, 3): contact key, contact point [m]
+        friction (nc,), mu (nc,): friction coefficient, and that of the cones: zero in impacts that are `smooth`
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
         compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
@@ -74,8 +76,10 @@ class ContactSystem:
         free_large (large, 6): the same of the large bodies, without attraction, on all ranks
         middle (owned, 3): the angular velocities about which those of the step are linear in the impulses, see
         `dem.free_motion.free_spin`, or None
-        resistance: the rows of `dem.step.rolling`, or None
-        attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.step.cohesion`
+        resistance: the rows of `dem.step.resistance`, or None
+        met: the contacts, as the laws of contact see them; None where none adds anything
+        past (nc, columns): what the laws of contact kept of them in the last step
+        attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.parts.laws`
         drives: of the large bodies, the same on all ranks
         at_once: how many contacts of this rank bounce with all others of the step, and not in their order
         coupling: by constraints, a `dem.unconstrained.constraints.Coupling`; None if there are none
@@ -85,19 +89,28 @@ class ContactSystem:
     def __init__(
         self, world: World, contacts: Contacts, motion: UnconstrainedMotion, recovery_speed: float = np.inf,
         last: Floats | None = None, eased: tuple[Keys, Floats] | None = None, smooth: bool = False,
+        kept: Floats | None = None,
     ) -> None:  # fmt: skip
         """`recovery_speed` [m/s] bounds the speed at which overlaps of rigid contacts are pushed apart. `last`: what
         the memory of the last step has of these contacts (parts nc, 3): the impulses that they are expected to have,
         and with which springs begin. `eased`: contacts that bounce with a part of e alone, by key, from the method of
-        that name; `smooth`: impacts without friction."""
+        that name; `smooth`: impacts without friction; `kept` (nc, columns): what the laws of contact kept of these
+        contacts."""
         dt, near, owned = motion.dt, contacts.near, world.owned
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
         self.dt, self.contacts, self.near, self.drives, self.applied = dt, contacts, near, motion.drives, motion.applied
-        self.key, self.mu, self.point = contacts.key, contacts.friction, contacts.point
+        self.key, self.point = contacts.key, contacts.point
         self.frame = contact_frames(contacts.normal)
         self.contact_map = _map_of(world, contacts, self.frame, self.drives)
-        self.attraction = attraction(world, contacts, dt)
+        self.surface = surface_velocities(world, contacts, self.frame)
+        self.take_flow(world, contacts)
+        self.past = np.zeros((len(contacts), world.pairs.columns)) if kept is None else kept
+        self.met = met(world, contacts, dt, self._slip(contacts)) if world.pairs.acting else None
+        pull = None if self.met is None else world.pairs.pull(self.met, self.past)
+        self.attraction = None if pull is None else dt * pull
+        self.mu = contacts.friction if self.met is None else world.pairs.cone(self.met, self.past, contacts.friction)
+        self.friction = self.mu
         last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
         self.motion, change = self._linearised(world, motion, last)
         self.coupling = self.motion.coupling
@@ -107,10 +120,8 @@ class ContactSystem:
         self.b = np.zeros((len(contacts), 3))
         self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
         self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
-        self.surface = surface_velocities(world, contacts, self.frame)
         if self.surface is not None:
             self.b[:, 1:] = self.surface
-        self.take_flow(world, contacts)
         self.cell = cell_of(world, contacts, self.frame, dt)
         if self.cell is not None:
             mass = CellMass(world.comm, self.contact_map.given.root, self.cell)
@@ -231,10 +242,26 @@ class ContactSystem:
         eased = self._part < 1.0
         return self.key[eased], self._part[eased]
 
+    def _slip(self, contacts: Contacts) -> Floats:
+        """The relative velocities (nc, 2) along the surfaces before the step [m/s]."""
+        slip = self.contact_map.relative_velocities(contacts.near.bodies.velocity)[:, 1:]
+        slip = slip if self.surface is None else slip + self.surface
+        return slip if self.drift is None else slip + self.drift[:, 1:]
+
     def held_after(self, impulse: Floats) -> Floats:
         """Impulses of the step (parts nc, 3), see `ContactLaw.parts`, with what tangential springs hold at its end
         in the place of the tangential ones [N s]."""
         return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
+
+    def keep(self, world: World, impulse: Floats, momentum: Floats) -> Floats:
+        """What the laws of contact keep (nc, columns) for the next step, for the impulses (parts nc, 3) of the cone
+        problem and their momenta; collective."""
+        if not world.pairs.columns or self.met is None:
+            return self.past
+        count = len(self.key)
+        impulse, change = impulse[:count], self.problem_map.velocities(momentum.reshape(-1, 6))[:count]
+        slip = (self.r + change)[:, 1:] + self.compliance[:, 1:] * impulse[:, 1:]
+        return world.pairs.keep(self.met, self.past, Solved(impulse, self.mu, np.hypot(*slip.T)))
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
@@ -283,7 +310,7 @@ class ContactSystem:
 
     def impulse_on_large(self, impulse: Floats, moment: Floats | None = None) -> Floats:
         """Impulses and angular impulses D g (large, 6) on the large bodies, the same on all ranks, from the impulses
-        and the moments of `dem.step.rolling` (nc, 3) of all ranks [N s, N m s]; collective."""
+        and the moments of `dem.step.resistance` (nc, 3) of all ranks [N s, N m s]; collective."""
         first = self.near.grains + self.near.ghosts
         rows = np.flatnonzero(self.contact_map.body[:, 1] >= first)  # body b has the higher id
         sums = self.contact_map.sums_of_impulses(impulse, rows)

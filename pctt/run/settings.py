@@ -153,7 +153,8 @@ class Settings(ccp.Limits):
         if resists and self.newton == "contact":
             raise OptionError("-ccp_newton contact: the scene has rolling or spinning resistance; allowed is body")
         if delta < scene.reach:
-            raise OptionError(f"-delta {delta:g} m: cohesion acts up to {scene.reach:g} m; allowed is at least that")
+            allowed = f"bodies attract each other up to {scene.reach:g} m; allowed is at least that"
+            raise OptionError(f"-delta {delta:g} m: {allowed}")
         speed = self.closing_speed
         if speed is None:
             speed = math.inf if paper or delta == 0.0 or math.isinf(self.closing_work) else CLOSING * delta / dt

@@ -170,13 +170,15 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
     try:
         world = restored_world(scene, comm, local, replicated)
         restore(world, changed)
-        memory, (key, impulse) = ImpulseMemory(comm, world.pairs.parts), impulses
-        right = np.isfinite(impulse).all() and impulse.shape == (len(key), 4 * world.pairs.parts)
+        memory, (key, impulse) = ImpulseMemory(comm, world.pairs.parts, world.pairs.columns), impulses
+        right = np.isfinite(impulse).all() and impulse.shape == (len(key), memory.width)
         right = right and len(np.unique(key)) == len(key)
         refuse(comm, "" if right else "impulses of contacts that are no numbers, or two of one contact")
     except (AttributeError, KeyError, TypeError, ValueError) as error:  # of another scene file
         raise OptionError(f"-restart {path}: {error}") from None
-    memory.restore(key, impulse if old["dt"] == made_with["dt"] else impulse * (made_with["dt"] / old["dt"]))
+    if old["dt"] != made_with["dt"]:
+        impulse[:, : 4 * world.pairs.parts] *= made_with["dt"] / old["dt"]
+    memory.restore(key, impulse)
     return world, memory
 
 
@@ -299,7 +301,7 @@ def _settle(
     tenth, tol, begun = max(1, end // 10), settings.settle_tol, time.perf_counter()
     say(f"settling {scene_name(experiment)}, {end} steps with APGD to {tol:g}:")
     world = world_at_start(experiment, scene, comm)
-    memory = ImpulseMemory(comm, world.pairs.parts)
+    memory = ImpulseMemory(comm, world.pairs.parts, world.pairs.columns)
     if comm.bcast(unfinished(path).exists()):
         try:
             world, memory = load(unfinished(path), scene, made_with, comm)

@@ -46,6 +46,7 @@ class Made:
     step: Step  #: its world is that at the end of the step
     figures: dict[str, Any]  #: the line of the step in steps.jsonl
     held: Array  #: (parts nc, 3) impulses with which springs begin the next step
+    kept: Array  #: (nc, columns) what the laws of contact keep
 
 
 class Stepper:
@@ -92,7 +93,7 @@ class Stepper:
         """Let the world and the memory be those at the end of this step."""
         system = made.step.system
         self.world.take(made.step.world)
-        self.memory.remember(system.key, made.held, system.frame)
+        self.memory.remember(system.key, made.held, system.frame, made.kept)
         self._slabs = self.world.slabs
 
     def _made(self, world: World) -> Made:
@@ -106,8 +107,8 @@ class Stepper:
             contacts = in_order(world, find_contacts(world, given.delta, free), free)
         while True:
             with log.phase("assembly"):
-                last = self._recalled(world, contacts)
-                system = ContactSystem(world, contacts, free, given.recovery_speed, last, eased, smooth)
+                last, kept = self._recalled(world, contacts)
+                system = ContactSystem(world, contacts, free, given.recovery_speed, last, eased, smooth, kept)
                 free = system.motion  # with the joints
                 guess = last if found is None else found.recall(system.key, system.frame, elsewhere=False)[0]
                 problem = cone_problem(system, world.comm)
@@ -138,13 +139,14 @@ class Stepper:
             system.take_flow(world, contacts)
             advance(world, free, contacts, velocity, system.kept(velocity))
             step = Step(world, contacts, system, *system.parts(result.impulse))
-            held = system.held_after(result.impulse)
-        return Made(step, self._figures(world, problem.size, result, files), held)
+            held, kept = system.held_after(result.impulse), system.keep(world, result.impulse, result.momentum)
+        return Made(step, self._figures(world, problem.size, result, files), held, kept)
 
-    def _recalled(self, world: World, contacts: Contacts) -> Array:
-        """The impulses (parts nc, 3) of the last step of these contacts."""
+    def _recalled(self, world: World, contacts: Contacts) -> tuple[Array, Array]:
+        """The impulses (parts nc, 3) of the last step of these contacts, and what laws kept of them (nc, columns)."""
         elsewhere = self._slabs is not world.slabs
-        return self.memory.recall(contacts.key, contact_frames(contacts.normal), elsewhere)[0]
+        impulse, _, kept = self.memory.recall(contacts.key, contact_frames(contacts.normal), elsewhere)
+        return impulse, kept
 
     def _solved(
         self, world: World, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, before: ccp.Result | None
@@ -250,7 +252,7 @@ def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
     cones: Cones = ccp.FrictionCones(system.mu)
     if (resists := system.resistance) is not None:
         r = np.concatenate([r, resists.velocity])
-        cones = ccp.RollingCones(system.mu, resists.rolling, resists.spinning)
+        cones = ccp.RollingCones(system.mu, *resists.most)
     return ccp.ConeProblem(comm, r, cones=cones, G=G, point=point, key=key, compliance=soft)
 
 

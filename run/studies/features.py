@@ -125,9 +125,11 @@ FEATURES = {
     "periodic": Feature(bed, lambda: bed(walls=False), ("dem/parts/cell.py", "dem/model/images.py")),
     "shear": Feature(lambda: flow(at_rest=True), flow, ()),
     "servo": Feature(lambda: flow(constant=True), flow, ("contact_map/mass.py", "dem/step/servo.py")),
-    "rolling": Feature(bed, lambda: bed(rolling=5e-4, spinning=1e-4), ("dem/step/rolling.py",
+    "rolling": Feature(bed, lambda: bed(rolling=5e-4, spinning=1e-4), ("laws/rolling.py", "dem/step/resistance.py",
     "contact_map/turning.py")),
-    "cohesion": Feature(bed, lambda: bed(cohesion=1e-3, cohesion_range=1e-4), ("dem/step/cohesion.py",)),
+    "cohesion": Feature(bed, lambda: bed(cohesion=1e-3, cohesion_range=1e-4), ("laws/cohesion.py",)),
+    "bridges": Feature(bed, lambda: bed(bridge_volume=1e-10, surface_tension=0.07), ("laws/bridges.py",)),
+    "static_friction": Feature(bed, lambda: bed(static_friction=0.5), ("laws/static_friction.py",)),
     "restitution": Feature(bed, lambda: bed(restitution=0.5), ("_bounce",)),
     "measures": Feature(bed, bed, ("dem/measures",), measured),
 }

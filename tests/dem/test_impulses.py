@@ -56,7 +56,7 @@ def test_memory_does_not_depend_on_who_asks():
     def check(memory, seed):
         mine = part(seed)
         asked = np.concatenate([keys[mine], [4, 12]])  # the last two are unknown
-        recalled, found = memory.recall(asked, np.tile(np.eye(3), (len(asked), 1, 1)))
+        recalled, found, _ = memory.recall(asked, np.tile(np.eye(3), (len(asked), 1, 1)))
         assert found[:-2].all()
         assert not found[-2:].any()
         assert (recalled[:-2] == impulse[mine]).all()

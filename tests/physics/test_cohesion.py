@@ -51,7 +51,7 @@ def test_attraction_ends_with_its_range():
         with pctt.Simulation(hanging(1, 3.0 * MASS * G, gap), dt=1e-3, **EXACT) as sim:
             sim.run(steps=5)
             np.testing.assert_allclose(sim.velocities[0, 2], (pull - 1.0) * G * 5e-3, rtol=1e-9)
-    with pytest.raises(OptionError, match="cohesion acts up to 0.01 m"):
+    with pytest.raises(OptionError, match="bodies attract each other up to 0.01 m"):
         pctt.Simulation(hanging(1, 1.0), delta=0.005)
     with pytest.raises(ValueError, match="needs a cohesion_range"):
         hanging(1, 1.0, reach=0.0)

@@ -1,4 +1,4 @@
-"""Resistance of contacts to rolling and spinning: the greatest moments, over the normal force, are lengths [m].
+"""Moments with which contacts resist the turning of their bodies against each other.
 
 Moments are measured in force times a length of each contact, and turning velocities in that length times an angular
 velocity: so all numbers of a contact have the same units and about the same size, and the residual of a solver means
@@ -22,15 +22,15 @@ class Resistance(NamedTuple):
 
     map: TurningMap
     length: Floats  #: (nc,) [m]
-    rolling: Floats  #: (nc,) coefficients over the lengths
-    spinning: Floats  #: (nc,) likewise
+    most: tuple[Floats, Floats]  #: (nc,) each: moments about tangents and normals over normal forces and lengths
     velocity: Floats  #: (nc, 3) lengths times angular velocities without impulses [m/s]
 
 
 def resistance(world: World, contacts: Contacts, known: ContactMap, frame: Floats, free: Floats) -> Resistance | None:
     """Of contacts with their map without turning, frames (nc, 3, 3), and the free velocities (rows, 6) of all bodies in
     the rows of `near`; None, on all ranks, in a world without resistance."""
-    if not world.pairs.resists:
+    moments = world.pairs.moments()
+    if moments is None:
         return None
     table, a, b = contacts.near.bodies, contacts.a, contacts.b
     one, two = table.material[a], table.material[b]
@@ -39,5 +39,5 @@ def resistance(world: World, contacts: Contacts, known: ContactMap, frame: Float
     length = np.sqrt(np.divide(mobility, turns, out=np.ones(len(a)), where=(turns > 0.0) & (mobility > 0.0)))
     turn = (frame * length[:, None, None]).reshape(-1, 9)
     G = TurningMap(known.comm, known.given, turn, known.halo, known.body, mass=known.mass)
-    rolling, spinning = (values[one, two] / length for values in (world.pairs.rolling, world.pairs.spinning))
-    return Resistance(G, length, rolling, spinning, G.turning(free))
+    tangents, normals = (values[one, two] / length for values in moments)
+    return Resistance(G, length, (tangents, normals), G.turning(free))

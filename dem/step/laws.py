@@ -1,0 +1,29 @@
+"""What the laws of contact see of the contacts of a step."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dem import bodies
+from dem.arrays import Floats
+from dem.bodies import COMPOUND
+from dem.contact import Contacts
+from dem.model.world import World
+from dem.parts.laws import Met
+
+
+def met(world: World, contacts: Contacts, dt: float, slip: Floats) -> Met:
+    """The contacts of a step of dt [s] that slip (nc, 2) along their surfaces [m/s]."""
+    table, a, b = contacts.near.bodies, contacts.a, contacts.b
+    with np.errstate(divide="ignore"):  # of two large bodies, which are flat: inf
+        curvature = 1.0 / np.where(table.shape == COMPOUND, np.inf, bodies.least_half_thickness(table))
+        radius = 2.0 / (curvature[a] + curvature[b])
+    mobility = 1.0 / table.mass[a] + 1.0 / table.mass[b]
+    return Met(dt, (table.material[a], table.material[b]), contacts.gap, radius, mobility, np.hypot(*slip.T))
+
+
+def along_normal(size: Floats) -> Floats:
+    """Impulses (nc, 3) of these sizes (nc,) along the normals."""
+    out = np.zeros((len(size), 3))
+    out[:, 0] = size
+    return out
