@@ -12,10 +12,13 @@ from dem.checks import check_fields, positive
 from dem.compiled import inlined, loop
 from dem.shapes.convex import Convex, revolved
 
-#: Points of a rim that stay with the body and may be contacts; the lowest one is a further one.
+#: Points of a rim that may be contacts. Evenly spread ones bear tilts in all directions alike.
 RIM = 6
 
-#: Sine of a tilt below which a cylinder stands on its end: the lowest point of the rim has no direction of its own.
+#: Sine of a tilt below which these stay with the body; above, one of them is the lowest point of the rim.
+EVEN = 1e-6
+
+#: Sine of a tilt below which the lowest point does not roll: its direction may be another one a step later.
 LEVEL = 0.01
 
 
@@ -34,17 +37,13 @@ def _face(numbers, x, y, z, point, name):
             point[k, 0], point[k, 1], point[k, 2] = radius * x / across, radius * y / across, half * (2 * k - 1)
             name[k] = RIM + k
         return 2, radius
-    count, ahead, per = 0, np.arctan2(y, x) * RIM / (2.0 * np.pi), 2.0 * np.pi / RIM
-    ahead += RIM if ahead < 0.0 else 0.0
+    per = 2.0 * np.pi / RIM
+    lowest = np.arctan2(y, x) / per if across > EVEN * abs(z) else 0.0
     for k in range(RIM):
-        point[count, 0], point[count, 1], name[count] = radius * np.cos(k * per), radius * np.sin(k * per), k
-        count += 1
-        if across > 1e-12 * abs(z) and k + 1e-6 < ahead < k + 1 - 1e-6:
-            point[count, 0], point[count, 1], name[count] = radius * x / across, radius * y / across, RIM + (z > 0.0)
-            count += 1
-    for k in range(count):
+        angle = (k + lowest - np.round(lowest)) * per
+        point[k, 0], point[k, 1], name[k] = radius * np.cos(angle), radius * np.sin(angle), k
         point[k, 2] = np.copysign(half, z)
-    return count, 0.0
+    return RIM, 0.0
 
 
 @inlined
