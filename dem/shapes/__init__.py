@@ -15,6 +15,7 @@ from dem.checks import check_fields, finite, positive, rows, unit_quaternion, un
 from dem.mesh import Mesh
 from dem.shapes.convex import Convex, centred
 from dem.shapes.cylinder import Cylinder
+from dem.shapes.superellipsoid import Superellipsoid
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Capsule:
 
 
 #: The kinds of convex shapes that are known by their support functions.
-CONVEX_SHAPES: tuple[type[Convex], ...] = (Cylinder,)
+CONVEX_SHAPES: tuple[type[Convex], ...] = (Cylinder, Superellipsoid)
 
 Shape = Union[Plane, Box, Sphere, Capsule, Mesh, Convex]
 
