@@ -20,8 +20,8 @@ SPHERE, BOX, COMPOUND, CAPSULE, PLANE, MESH = range(6)
 #: alike, so that nothing else needs to know what they are.
 FORM = 6
 
-#: Of clumps of spheres, of convex polyhedra, and of other convex bodies: CLUMP + n, POLYHEDRON + n or CONVEX + n has the
-#: form n of `dem.scene.Scene.forms`.
+#: Of clumps of spheres, of convex polyhedra, and of other convex bodies: CLUMP + n, POLYHEDRON + n or CONVEX + n has
+#: the form n of `dem.scene.Scene.forms`.
 CLUMP, POLYHEDRON, CONVEX = FORM, 1 << 20, 1 << 21
 
 

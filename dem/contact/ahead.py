@@ -43,8 +43,8 @@ FURTHEST = 0.25
 #: Half thicknesses of a guest by which a linear gap may overlap before the overlap at the start is looked up.
 DEEP = 0.005
 
-#: Of spheres, boxes, -, capsules, half spaces, meshes, polyhedra, other convex bodies: of a pair the one of lower rank is
-#: the guest.
+#: Of spheres, boxes, -, capsules, half spaces, meshes, polyhedra, other convex bodies: of a pair the one of lower rank
+#: is the guest.
 RANK = np.array([0, 3, 9, 1, 5, 6, 4, 2])
 
 
@@ -120,7 +120,8 @@ def turn_ahead(
         swap = guest_is_second(kind[one], kind[two])
         a, b = (two, one) if swap else (one, two)
         A, B, sign = row[a], row[b], -1.0 if swap else 1.0
-        V, W, u, w = vector_of(velocity[A], 0), vector_of(velocity[B], 0), vector_of(velocity[A], 3), vector_of(velocity[B], 3)
+        V, u = vector_of(velocity[A], 0), vector_of(velocity[A], 3)
+        W, w = vector_of(velocity[B], 0), vector_of(velocity[B], 3)
         h, _ = ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
         here = kind[a] == SPHERE and kind[b] in (SPHERE, PLANE, BOX)
         core = size[a, 0] if kind[a] in (SPHERE, CAPSULE) else 0.0  # its surface turns with the normal, not with a body

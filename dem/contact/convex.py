@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dem.arrays import Floats, Ints
-from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, POLYHEDRON, SPHERE
+from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, half_thickness
 from dem.compiled import inlined, loop
 from dem.contact.ahead import after_turn, ahead_by, guest_is_second, spun, vector_of
 from dem.contact.narrow import DISTINCT, Manifold, Planes
@@ -43,8 +43,8 @@ SHRUNK = np.array([0.9, 0.7, 0.4, 0.1])
 #: What a shape is: a ball or capsule, a box, a hull, or a row of `CONVEX_SHAPES` after these.
 ROD, BLOCK, HULL, OTHER = range(4)
 
-#: Names of the contacts of a pair: points of faces, from here on crossings of their sides, points of the second, and the
-#: closest point.
+#: Names of the contacts of a pair: points of faces, from here on crossings of their sides, points of the second, and
+#: the closest point.
 CROSSING, SECOND, CLOSEST = 32, 96, 128
 
 POINTS = 64  #: of a face, and contacts of a pair, at most
@@ -66,7 +66,8 @@ def supports_of(forms: tuple[Form, ...]) -> Supports:
     for n, form in enumerate(forms):
         if isinstance(form, ConvexForm):
             shape = form.shape
-            found.what[n], found.numbers[n, : len(shape.numbers)] = OTHER + CONVEX_SHAPES.index(type(shape)), shape.numbers
+            found.what[n] = OTHER + CONVEX_SHAPES.index(type(shape))
+            found.numbers[n, : len(shape.numbers)] = shape.numbers
             found.radius[n], found.rounding[n] = form.size[0], shape.rounding
     return found
 
@@ -88,7 +89,7 @@ def solids(kind: Ints, center: Floats, turn: Floats, size: Floats, hulls: Hulls,
     """Those of rows (m,) of `dem.contact.primitives.Primitives`, with frames (m, 3, 3)."""
     what, numbers, hull = np.zeros(len(kind), np.int64), np.zeros((len(kind), 6)), np.zeros(len(kind), np.int64)
     scale, rounding = np.ones(len(kind)), np.where(np.isin(kind, (SPHERE, CAPSULE)), size[:, 0], 0.0)
-    numbers[:, :3], thick = size, np.where(kind == BOX, size.min(axis=1), np.where(kind >= CLUMP, size[:, 2], size[:, 0]))
+    numbers[:, :3], thick = size, half_thickness(kind, size)
     what[kind == BOX] = BLOCK
     other, rows = kind >= CONVEX, (kind >= POLYHEDRON) & (kind < CONVEX)
     what[rows], hull[rows] = HULL, kind[rows] - POLYHEDRON + 1
@@ -280,8 +281,8 @@ def _face(solid, hulls, m, x, y, z, point, name):
 
 @loop
 def _laid(solid, hulls, m, frame, sign, apart, point, name, flat, slope):
-    """Fill in what lies flush along a normal, `sign` times the third axis of the frame: points (k, 2) across it, and the
-    plane or line through them: height, and gradients. Returns k, the radius across it where it is a line, and the sense
+    """Fill in what lies flush along a normal, `sign` times the third axis of the frame: points (k, 2) across it, and
+    the plane or line through them: height, and gradients. Returns k, the radius across it where it is a line, and the sense
     in which the points turn."""
     n = frame[2]
     x, y, z = _inward(solid.turn[m], (sign * n[0], sign * n[1], sign * n[2]))
@@ -324,7 +325,8 @@ def _within(flat, count, sense, a, b, c, d, slack):
         i = (k + 1) % count
         u, v = sense * (flat[i, 0] - flat[k, 0]), sense * (flat[i, 1] - flat[k, 1])
         side = slack * np.sqrt(u * u + v * v)
-        one, two = u * (b - flat[k, 1]) - v * (a - flat[k, 0]) + side, u * (d - flat[k, 1]) - v * (c - flat[k, 0]) + side
+        one = u * (b - flat[k, 1]) - v * (a - flat[k, 0]) + side
+        two = u * (d - flat[k, 1]) - v * (c - flat[k, 0]) + side
         if one < 0.0 and two < 0.0:
             return 1.0, 0.0
         if one < 0.0:

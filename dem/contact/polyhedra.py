@@ -496,8 +496,8 @@ def _distance(p, many, q, others, x, y, z, reach, size, way, ends, share, parts)
 
 @loop
 def nearer(count, square, way, ends, share, parts):
-    """Make of a simplex of so many points of `way` (4, 3), and of the point that follows them, the part that is nearest to
-    the origin, if it is nearer than `square`: how many points it has, the square of its distance, and its place. The
+    """Make of a simplex of so many points of `way` (4, 3), and of the point that follows them, the part that is nearest
+    to the origin, if it is nearer than `square`: how many points it has, the square of its distance, and its place. The
     rows `ends` (4, 2) go with the points; their `share` (4,) is filled in."""
     first, second, better = 0, 0, np.inf  # the new simplex: `first`, `second` and the last of the points
     if count == 0:

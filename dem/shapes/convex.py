@@ -66,7 +66,7 @@ class Convex:
         return 0.0
 
     def surface(self) -> tuple[Floats, Ints]:
-        """Vertices (v, 3) [m], and triangles (t, 3) of these, for pictures; one is as far out as the sphere about it."""
+        """Vertices (v, 3) [m], and triangles (t, 3) of these, for pictures; one vertex is on the sphere about it."""
         raise NotImplementedError
 
 

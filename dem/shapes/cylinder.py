@@ -66,7 +66,8 @@ class Cylinder(Convex):
 
     radius: float  #: [m]
     length: float  #: from end to end [m]
-    support, face, rolls, arc = map(staticmethod, (_support, _face, _rolls, _arc))
+    support, face = staticmethod(_support), staticmethod(_face)
+    rolls, arc = staticmethod(_rolls), staticmethod(_arc)
 
     def __post_init__(self) -> None:
         check_fields(self, radius=positive, length=positive)

@@ -80,7 +80,8 @@ class Superellipsoid(Convex):
 
     axes: Sequence[float]  #: (3,) half lengths [m]
     exponents: Sequence[float] = (2.0, 2.0)  #: (2,) n of sections along z, m of those across; from 2 to 20
-    support, face, rolls, arc = map(staticmethod, (_support, _face, _rolls, _arc))
+    support, face = staticmethod(_support), staticmethod(_face)
+    rolls, arc = staticmethod(_rolls), staticmethod(_arc)
 
     def __post_init__(self) -> None:
         check_fields(self, axes=positive)
@@ -109,7 +110,8 @@ class Superellipsoid(Convex):
 
         def furthest(one: float, other: float, n: float) -> float:
             both = np.array([one, other])
-            return float(both.max() * np.linalg.norm(both / both.max(), 2.0 * n / (n - 2.0)) if n > 2.0 else both.max())
+            most = both.max()
+            return float(most * np.linalg.norm(both / most, 2.0 * n / (n - 2.0)) if n > 2.0 else most)
 
         (a, b, c), (n, m) = self.axes, self.exponents
         return furthest(furthest(a, b, m), c, n), min(self.axes)
