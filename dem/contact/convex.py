@@ -282,8 +282,8 @@ def _face(solid, hulls, m, x, y, z, point, name):
 @loop
 def _laid(solid, hulls, m, frame, sign, apart, point, name, flat, slope):
     """Fill in what lies flush along a normal, `sign` times the third axis of the frame: points (k, 2) across it, and
-    the plane or line through them: height, and gradients. Returns k, the radius across it where it is a line, and the sense
-    in which the points turn."""
+    the plane or line through them: height, and gradients. Returns k, the radius across it where it is a line, and the
+    sense in which the points turn."""
     n = frame[2]
     x, y, z = _inward(solid.turn[m], (sign * n[0], sign * n[1], sign * n[2]))
     count, bend = _face(solid, hulls, m, x, y, z, point, name)

@@ -75,8 +75,8 @@ def supports(numbers: Floats, way: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Superellipsoid(Convex):
-    """All points with ((|x/a|^m + |y/b|^m)^(n/m) + |z/c|^n <= 1 for the `axes` a, b, c and the `exponents` n, m; 2 and 2
-    are those of an ellipsoid."""
+    """All points with ((|x/a|^m + |y/b|^m)^(n/m) + |z/c|^n <= 1 for the `axes` a, b, c and the `exponents` n, m; 2 and
+    2 are those of an ellipsoid."""
 
     axes: Sequence[float]  #: (3,) half lengths [m]
     exponents: Sequence[float] = (2.0, 2.0)  #: (2,) n of sections along z, m of those across; from 2 to 20
