@@ -114,7 +114,7 @@ def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) ->
 
 
 def solids_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> Manifold:
-    """What of the body lies flush along the plane: the points of a face or a side, or the support."""
+    """What of the body lies flush along the plane: the points of a face or a side, and the support."""
     room = len(delta) * POINTS
     pair, feature, out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7))
     outward, origin = (np.ascontiguousarray(column) for column in plane)
@@ -503,9 +503,16 @@ def _planes(body, hulls, outward, origin, delta, pair, feature, out):
         normal = vector_of(outward[m], 0)
         x, y, z = _inward(body.turn[m], (-normal[0], -normal[1], -normal[2]))
         count, _ = _face(body, hulls, m, x, y, z, point, name)
+        # The support, unless it is among them, as of a face with edges.
+        point[count, 0], point[count, 1], point[count, 2] = _support(body, hulls, m, 0.0, x, y, z)
+        name[count], least = CLOSEST, -np.inf
+        for k in range(count if count > 1 else 0):
+            least = max(least, dot(point[k], (x, y, z)))
         if count == 1:
-            point[0, 0], point[0, 1], point[0, 2] = _support(body, hulls, m, 0.0, x, y, z)
-            name[0] = 0
+            for n in range(3):
+                point[0, n], name[0] = point[1, n], CLOSEST
+        elif dot(point[count], (x, y, z)) > least + DISTINCT * body.thick[m] / body.scale[m]:
+            count += 1
         for k in range(count):
             place = plus(vector_of(body.center[m], 0), body.scale[m], _outward(body.turn[m], point[k]))
             gap = dot(plus(place, -1.0, origin[m]), normal)

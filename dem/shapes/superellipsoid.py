@@ -21,6 +21,11 @@ from dem.shapes.convex import Convex, revolved
 #: Exponents that are allowed: convex, with the ball of the shortest axis in it, and edges that a search can follow.
 EXPONENTS = between(2.0, 20.0)
 
+#: Cosine of the angle to an axis within which a flat side faces a direction; tangent of that of the normals, along flat
+#: sections, at the points of it that bear beside the closest one: a body on a flat side would rock on one alone.
+FACING = 0.9
+TILT = 0.1
+
 GRID = 24  #: intervals of a quarter of the directions in which the curvature is looked up
 SAFE = 0.9  #: what counts of the least radius found, as there may be lesser ones between
 
@@ -49,14 +54,34 @@ def _support(numbers, skin, x, y, z):
     )  # fmt: skip
 
 
-@inlined
+@loop
 def _face(numbers, x, y, z, point, name):
-    return 1, 0.0
+    """Four points of a side that is flat both ways, two of one that is flat one way."""
+    way, axis = (x, y, z), 0
+    for k in range(3):
+        axis = k if abs(way[k]) > abs(way[axis]) else axis
+    one, two = (axis + 1) % 3, (axis + 2) % 3
+    flat_one = numbers[3 if axis == 2 or one == 2 else 4] > 2.0
+    flat_two = numbers[3 if axis == 2 or two == 2 else 4] > 2.0
+    if abs(way[axis]) < FACING * np.sqrt(x * x + y * y + z * z) or not (flat_one or flat_two):
+        return 1, 0.0
+    count = 4 if flat_one and flat_two else 2
+    for k in range(count):
+        ahead, beside = 2 * (k in (1, 2)) - 1, 2 * (k > 1) - 1
+        for n in range(3):
+            name[k], point[k, n] = k, 0.0
+        point[k, axis] = np.copysign(1.0, way[axis])
+        point[k, one] = TILT * ahead if flat_one else 0.0
+        point[k, two] = TILT * (beside if flat_one else ahead) if flat_two else 0.0
+        point[k, 0], point[k, 1], point[k, 2] = _support(numbers, 0.0, point[k, 0], point[k, 1], point[k, 2])
+    return count, numbers[two if flat_one else one] ** 2 / numbers[axis] if count == 2 else 0.0
 
 
 @inlined
 def _rolls(numbers, x, y, z, u, v, w):
-    return True
+    """On the closest point."""
+    p, q, r = _support(numbers, 0.0, x, y, z)
+    return u * x + v * y + w * z > (1.0 - 1e-6) * (p * x + q * y + r * z)
 
 
 @inlined

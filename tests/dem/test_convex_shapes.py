@@ -8,6 +8,7 @@ from mpi4py import MPI
 
 from dem import quaternion
 from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE
+from dem.contact import find_contacts
 from dem.contact.convex import solids, solids_planes, solids_solids, supports_of
 from dem.contact.narrow import CORNERS, Planes
 from dem.contact.polyhedra import hulls_of
@@ -203,3 +204,15 @@ def test_large_bodies_have_such_shapes_and_grains_a_scale():
         inside = np.einsum("ti,ti->", vertex[a], np.cross(vertex[b], vertex[c])) / 6.0
         assert inside == pytest.approx(form(shape).volume, rel=0.02)  # so its triangles turn left from outside
         assert np.linalg.norm(vertex, axis=1).max() == pytest.approx(form(shape).size[0])
+
+
+def test_a_flat_side_of_a_superellipsoid_bears_beside_its_closest_point():
+    scene = Scene(0.3)
+    shape = Superellipsoid((0.3, 0.2, 0.1), (6, 6))
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_grains([(0, 0, 0.1)], shape, 900.0)
+    contacts = find_contacts(new_world(scene, MPI.COMM_SELF), 0.01)
+    assert len(contacts) == 5
+    assert contacts.gap.min() == pytest.approx(0.0, abs=1e-12)
+    (x, y), z = np.abs(contacts.point[:, :2].T), 0.1 - contacts.gap
+    np.testing.assert_allclose((x / 0.3) ** 6 + (y / 0.2) ** 6 + (z / 0.1) ** 6, 1.0, rtol=1e-9)
