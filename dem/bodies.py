@@ -20,8 +20,9 @@ SPHERE, BOX, COMPOUND, CAPSULE, PLANE, MESH = range(6)
 #: alike, so that nothing else needs to know what they are.
 FORM = 6
 
-#: Of clumps of spheres and of convex polyhedra: CLUMP + n or POLYHEDRON + n has the form n of `dem.scene.Scene.forms`.
-CLUMP, POLYHEDRON = FORM, 1 << 20
+#: Of clumps of spheres, of convex polyhedra, and of other convex bodies: CLUMP + n, POLYHEDRON + n or CONVEX + n has
+#: the form n of `dem.scene.Scene.forms`.
+CLUMP, POLYHEDRON, CONVEX = FORM, 1 << 20, 1 << 21
 
 
 @dataclass
@@ -95,8 +96,14 @@ def enclosing_radius(kind: Ints, size: Floats) -> Floats:
 
 def least_half_thickness(bodies: Bodies) -> Floats:
     """Radius (n,) of the greatest sphere that fits into a grain [m]."""
-    half = np.where(bodies.shape == BOX, bodies.size.min(axis=1), bodies.size[:, 0])
-    return np.where(bodies.shape >= FORM, bodies.size[:, 2], half)
+    return half_thickness(bodies.shape, bodies.size)
+
+
+def half_thickness(kind: Ints, size: Floats) -> Floats:
+    """Radius (n,) of the greatest sphere that fits into a shape of kind (n,) and size (n, 3), as of `dem.shapes.placed`
+    [m]; of a mesh into the box about it."""
+    half = np.where(np.isin(kind, (BOX, MESH)), size.min(axis=1), size[:, 0])
+    return np.where(kind >= FORM, size[:, 2], half)
 
 
 def turning(bodies: Bodies) -> Floats:

@@ -22,7 +22,7 @@ from mpi4py import MPI
 
 from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints, Rule
-from dem.bodies import BOX, CAPSULE, COMPOUND, MESH, PLANE, SPHERE, Bodies
+from dem.bodies import BOX, CAPSULE, COMPOUND, PLANE, SPHERE, Bodies
 from dem.geometry.survey import Survey, survey
 from dem.measures import Block, Cylinder
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
@@ -35,7 +35,8 @@ from dem.parts.named import Named
 from dem.parts.sources import Outlet, Passages, Source
 from dem.parts.springs import Spring
 from dem.quaternion import across, length
-from dem.shapes import Clump, Shape, clumps, polyhedra
+from dem.shapes import Clump, Shape, clumps, convex, polyhedra
+from dem.shapes.convex import Convex
 from dem.shapes.forms import Form
 
 #: The kinds of parts with names, in the order in which they act.
@@ -286,6 +287,27 @@ class Scene:
         form = polyhedra.solid(vertices)
         return self._add_form(form, positions, density, scale, quaternions, material, velocity, angular_velocity)
 
+    def add_grains(
+        self,
+        positions: ArrayLike,
+        shape: Convex,
+        density: ArrayLike,
+        *,
+        scale: ArrayLike = 1.0,
+        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        material: str = "default",
+        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Ints | range:
+        """Add solid grains of one convex `shape`, such as a `dem.shapes.Cylinder`, and return their ids (n,).
+
+        positions (n, 3) [m] and quaternions (4,) or (n, 4) are those of the frame of the shape, which must have its
+        origin there; a grain has the shape times its `scale`. scale and density [kg/m^3] one for all or (n,);
+        velocities (3,) or (n, 3). ValueError for other shapes.
+        """
+        form = convex.form(shape)
+        return self._add_form(form, positions, density, scale, quaternions, material, velocity, angular_velocity)
+
     def add_body(
         self,
         name: str,
@@ -337,6 +359,9 @@ class Scene:
         if isinstance(motion, Dynamic):
             body = _turning(body, motion)
         body = replace(body, surface=checked_surface(name, surface_velocity))
+        for shape in body.shapes:
+            if isinstance(shape, Convex):
+                self._know(convex.centred(shape))
         self.large_bodies.append(replace(body, material=self._material(material)))
 
     def add_load(
@@ -566,8 +591,7 @@ class Scene:
     ) -> Ints | range:  # fmt: skip
         """Add grains of one form, whose positions and quaternions are those of the frame in which it was given; their
         ids."""
-        if form not in self.forms:
-            self.forms.append(form)
+        self._know(form)
 
         def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
             turns, rho, times = _unit(given["quaternions"]), given["density"][:, None], given["scale"][:, None]
@@ -580,6 +604,10 @@ class Scene:
         return self._append(
             kind, positions, {"scale": scale}, density, material, quaternions, velocity, angular_velocity, solid
         )
+
+    def _know(self, form: Form) -> None:
+        if form not in self.forms:
+            self.forms.append(form)
 
     def _append(
         self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike, material: str,
@@ -667,9 +695,8 @@ def _turning(body: LargeBody, motion: Dynamic) -> LargeBody:
 
 def least_half(body: LargeBody) -> float:
     """The least half extent of the shapes of a large body [m]; inf of half spaces."""
-    parts = [shapes.placed(shape) for shape in body.shapes]
-    halves = [size.min() if kind in (BOX, MESH) else size[0] for kind, _, _, size in parts if kind != PLANE]
-    return float(min(halves, default=np.inf))
+    solid = [(kind, size) for kind, _, _, size in map(shapes.placed, body.shapes) if kind != PLANE]
+    return float(min((bodies.half_thickness(np.array([kind]), size[None])[0] for kind, size in solid), default=np.inf))
 
 
 def _refuse_in_cell(scene: Scene, radius: float) -> None:

@@ -195,6 +195,26 @@ sim = pctt.Simulation(scene, dt=0.005, solver="apgd", tol=1e-6)
 sim.run(until=1.5)
 print("it lies on both spheres:", len(sim.contacts), "contacts")
 
+# %% dem.shapes.Cylinder
+from math import pi
+
+from dem.shapes import Cylinder, mass_properties
+
+mass, _, inertia = mass_properties([Cylinder(radius=0.1, length=0.6)], density=1000.0)
+print("mass", round(mass, 3), "kg =", round(1000 * pi * 0.1**2 * 0.6, 3), "kg")
+
+# %% dem.shapes.Superellipsoid
+import pctt
+from dem.scene import Scene
+from dem.shapes import Plane, Superellipsoid
+
+scene = Scene(friction=0.5)
+scene.add_body("floor", [Plane(normal=(0, 0, 1))])
+scene.add_grains([[0, 0, 0.15]], Superellipsoid((0.2, 0.15, 0.1), exponents=(2, 3)), density=2500.0)
+sim = pctt.Simulation(scene, dt=0.005, solver="apgd", tol=1e-6)
+sim.run(until=0.5)
+print("it lies on its short axis, at", round(sim.positions[0, 2], 3), "m")
+
 # %% dem.mesh.Mesh
 from math import pi
 

@@ -50,6 +50,10 @@ ONLY = {
     "pctt.simulation": ["Body"],
     "dem.scene": ["LargeBody", "Scene"],
     "dem.unconstrained": ["UnconstrainedMotion", "unconstrained"],
+    "dem.shapes": [
+        "Plane", "Box", "Sphere", "Capsule", "Cylinder", "Superellipsoid", "Clump", "described", "placed", "solid",
+        "solid_properties", "mass_properties", "principal", "moved",
+    ],
     "dem.mesh": ["Mesh"],
     "dem.motion": ["Dynamic", "Fixed", "Glide", "Guided", "Held", "Hinged", "Oscillation", "Path", "Rotation"],
     "dem.parts.loads": ["Load"],

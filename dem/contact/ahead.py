@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
-from dem.bodies import BOX, CAPSULE, CLUMP, MESH, PLANE, POLYHEDRON, SPHERE
+from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPHERE
 from dem.compiled import inlined, loop
 from dem.contact.spheres import frame_of, to_box
 from dem.geometry.vectors import cross, dot, plus, shares, turned
@@ -43,8 +43,9 @@ FURTHEST = 0.25
 #: Half thicknesses of a guest by which a linear gap may overlap before the overlap at the start is looked up.
 DEEP = 0.005
 
-#: Of spheres, boxes, -, capsules, half spaces, meshes, polyhedra: of a pair the one of lower rank is the guest.
-RANK = np.array([0, 2, 9, 1, 4, 5, 3])
+#: Of spheres, boxes, -, capsules, half spaces, meshes, polyhedra, other convex bodies: of a pair the one of lower rank
+#: is the guest.
+RANK = np.array([0, 3, 9, 1, 5, 6, 4, 2])
 
 
 class Course(NamedTuple):
@@ -58,8 +59,16 @@ class Course(NamedTuple):
 
 def hosts_first(one: Ints, two: Ints) -> Bools:
     """Of which pairs of kinds (m,) the second is the guest."""
-    first: Bools = RANK[np.minimum(one, CLUMP)] > RANK[np.minimum(two, CLUMP)]
+    one, two = (np.where(kind >= CONVEX, CLUMP + 1, np.minimum(kind, CLUMP)) for kind in (one, two))
+    first: Bools = RANK[one] > RANK[two]
     return first
+
+
+@inlined
+def guest_is_second(one, two):
+    """The same of one pair."""
+    first = RANK[CLUMP + 1 if one >= CONVEX else min(one, CLUMP)]
+    return first > RANK[CLUMP + 1 if two >= CONVEX else min(two, CLUMP)]
 
 
 @loop
@@ -74,12 +83,12 @@ def seen_from(
     for p in range(len(i)):
         a, b = i[p], j[p]
         A, B = row[a], row[b]
-        h, speed = _ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
-        u, w, way[p] = _vector(velocity[A], 3), _vector(velocity[B], 3), h * speed
-        far = plus(_vector(place[A], 0), h, _vector(velocity[A], 0))
-        far = plus(far, 1.0, _after(plus(center[a], -1.0, place[A]), u, h))
-        far = _after(plus(plus(far, -h, _vector(velocity[B], 0)), -1.0, place[B]), w, -h)
-        q = _spun(_spun(quaternion[a], u, h), w, -h)
+        h, speed = ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
+        u, w, way[p] = vector_of(velocity[A], 3), vector_of(velocity[B], 3), h * speed
+        far = plus(vector_of(place[A], 0), h, vector_of(velocity[A], 0))
+        far = plus(far, 1.0, after_turn(plus(center[a], -1.0, place[A]), u, h))
+        far = after_turn(plus(plus(far, -h, vector_of(velocity[B], 0)), -1.0, place[B]), w, -h)
+        q = spun(spun(quaternion[a], u, h), w, -h)
         for k in range(3):
             middle[p, k] = place[B, k] + far[k]
         for k in range(4):
@@ -91,7 +100,7 @@ def seen_from(
 def turn_ahead(
     kind: Ints, row: Ints, center: Floats, quaternion: Floats, size: Floats, radius: Floats, inner: Floats,
     place: Floats, velocity: Floats, moves: Bools, dt: float, i: Ints, j: Ints, pair: Ints, point: Floats,
-    normal: Floats, gap: Floats,
+    normal: Floats, gap: Floats, arcs: Floats,
 ) -> tuple[Floats, Floats, Floats, Ints]:  # fmt: skip
     """Give contacts (nc,) of the pairs of rows i, j (m,) of `Primitives` the normals of the end of a step of dt [s] and
     the places of its start, of bodies of prescribed motion those of its end: `point` is as seen from the present place
@@ -101,55 +110,71 @@ def turn_ahead(
     places of `seen_from` get these as their `gap`; returns also which of them overlap by more than DEEP so.
 
     The bodies in the rows of `Primitives.row` are at `place` (rows, 3) and move with `velocity` (rows, 6); those that
-    impulses move are in `moves` (rows,).
+    impulses move are in `moves` (rows,). `arcs` (nc, 4, 3), as of `dem.contact.convex.arcs_of`; empty without such
+    shapes.
     """
     moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
     deep, found = np.empty(len(pair), np.int64), 0
     for c in range(len(pair)):
         one, two = i[pair[c]], j[pair[c]]
-        swap = RANK[min(kind[one], CLUMP)] > RANK[min(kind[two], CLUMP)]
+        swap = guest_is_second(kind[one], kind[two])
         a, b = (two, one) if swap else (one, two)
         A, B, sign = row[a], row[b], -1.0 if swap else 1.0
-        V, W, u, w = _vector(velocity[A], 0), _vector(velocity[B], 0), _vector(velocity[A], 3), _vector(velocity[B], 3)
-        h, _ = _ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
+        V, u = vector_of(velocity[A], 0), vector_of(velocity[A], 3)
+        W, w = vector_of(velocity[B], 0), vector_of(velocity[B], 3)
+        h, _ = ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
         here = kind[a] == SPHERE and kind[b] in (SPHERE, PLANE, BOX)
         core = size[a, 0] if kind[a] in (SPHERE, CAPSULE) else 0.0  # its surface turns with the normal, not with a body
         under = size[b, 0] if kind[b] in (SPHERE, CAPSULE) else 0.0
+        flat = under == 0.0
         apart = plus(place[A], -1.0, place[B])
         if here:
             lever, other = plus(center[a], -1.0, place[A]), plus(center[b], -1.0, place[B])
-            ahead, beside = _after(lever, u, h), _after(other, w, h)
+            ahead, beside = after_turn(lever, u, h), after_turn(other, w, h)
             end = plus(plus(plus(plus(center[a], -1.0, center[b]), h, V), -h, W), -1.0, beside)
             end = plus(plus(end, 1.0, plus(ahead, -1.0, lever)), 1.0, other)
             n, after = _from_host(end, kind[b], quaternion[b], size[b], core, w, h)
             their = plus(plus(other if kind[b] == SPHERE else beside, 1.0, end), core + after, n)
             own, inside = plus(lever, core, n), lever
         else:
-            n = _after((sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]), w, h)
-            middle, after = _after(plus(point[c], -1.0, place[B]), w, h), gap[c]
+            n = after_turn((sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]), w, h)
+            middle, after = after_turn(plus(point[c], -1.0, place[B]), w, h), gap[c]
             own = plus(plus(plus(middle, -0.5 * after, n), -1.0, apart), h, plus(W, -1.0, V))
             their = plus(middle, 0.5 * after, n)
-            inside = _after(plus(own, -core, n), u, -h)
+        # From what turns with the bodies to their surfaces, at the end and at the start.
+        arc, bow = (core * n[0], core * n[1], core * n[2]), (-under * n[0], -under * n[1], -under * n[2])
+        first_arc, first_bow = arc, bow
+        if kind[a] >= CONVEX:
+            arc, first_arc = vector_of(arcs[c, 0], 0), vector_of(arcs[c, 1], 0)
+        if kind[b] >= CONVEX:
+            bow, first_bow = vector_of(arcs[c, 2], 0), vector_of(arcs[c, 3], 0)
+            flat = dot(bow, bow) == 0.0
+        if not here:
+            inside = after_turn(plus(own, -1.0, arc), u, -h)
         if h == 0.0 or dot(n, n) == 0.0:
             continue
-        below = _after(plus(their, under, n), w, -h)
+        below = after_turn(plus(their, -1.0, bow), w, -h)
         if kind[b] == SPHERE:
             below = plus(center[b], -1.0, place[B])
         if moves[A]:
-            own = plus(inside, core, n)
-            if under == 0.0:
+            own = plus(inside, 1.0, first_arc)
+            if flat:
                 below = plus(own, 1.0, apart)  # the two arms lead to one place
         if moves[B] and kind[b] != SPHERE:
-            their = plus(below, -under, n)
+            their = plus(below, 1.0, first_bow)
         linear[c] = after - h * dot(n, plus(plus(W, 1.0, cross(w, their)), -1.0, plus(V, 1.0, cross(u, own))))
         half = 0.5 * min(gap[c] if here else linear[c], 0.0)
-        if moves[A] and under == 0.0:
+        if moves[A] and flat:
             below = plus(below, linear[c], n)
             their = below if moves[B] else their
         more = plus(_bend(below, w, dt), -1.0, _bend(inside, u, dt))
         if kind[b] != SPHERE:
-            more = plus(more, 1.0, cross(w, plus(plus(below, -under, n), -1.0, their)))
-        more = plus(more, -1.0, cross(u, plus(plus(inside, core, n), -1.0, own)))
+            more = plus(more, 1.0, cross(w, plus(plus(below, 1.0, first_bow), -1.0, their)))
+        more = plus(more, -1.0, cross(u, plus(plus(inside, 1.0, first_arc), -1.0, own)))
+        if kind[a] >= CONVEX:
+            more = plus(more, -0.5, cross(u, plus(arc, -1.0, first_arc)))
+        if kind[b] >= CONVEX:
+            more = plus(more, 0.5, cross(w, plus(bow, -1.0, first_bow)))
         more = plus(more, -dot(more, n), n)
         own, their = plus(own, half, n), plus(their, -half, n)
         if not here:
@@ -174,17 +199,17 @@ def _from_host(end, kind, quaternion, size, radius, spin, time):
         per, gap = (-1.0 / distance if distance > 0.0 else 0.0), distance - radius - size[0]
         x, y, z = per * end[0], per * end[1], per * end[2]
     elif kind == PLANE:
-        x, y, z = _after((-size[0], -size[1], -size[2]), spin, time)
+        x, y, z = after_turn((-size[0], -size[1], -size[2]), spin, time)
         gap = -(x * end[0] + y * end[1] + z * end[2]) - radius
     else:
-        back = _after(end, spin, -time)
+        back = after_turn(end, spin, -time)
         x, y, z, gap = to_box(back[0], back[1], back[2], radius, frame_of(quaternion), size)
-        x, y, z = _after((x, y, z), spin, time)
+        x, y, z = after_turn((x, y, z), spin, time)
     return (x, y, z), gap
 
 
 @inlined
-def _ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt):
+def ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt):
     """The time by which a pair of a guest a and a host b is foreseen: dt, or less where the surface of the one goes
     further along the other than FURTHEST allows; and the speed at which it goes."""
     least, other = _thickness(kind[a], size[a], inner), _thickness(kind[b], size[b], inner)
@@ -194,9 +219,9 @@ def _ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, v
     if least == np.inf:
         return 0.0, 0.0
     A, B = row[a], row[b]
-    u, w = _vector(velocity[A], 3), _vector(velocity[B], 3)
-    drift = plus(_vector(velocity[A], 0), 1.0, cross(u, plus(center[a], -1.0, place[A])))
-    drift = plus(drift, -1.0, _vector(velocity[B], 0))
+    u, w = vector_of(velocity[A], 3), vector_of(velocity[B], 3)
+    drift = plus(vector_of(velocity[A], 0), 1.0, cross(u, plus(center[a], -1.0, place[A])))
+    drift = plus(drift, -1.0, vector_of(velocity[B], 0))
     seat = center[b] if kind[b] in (SPHERE, CAPSULE) else center[a]  # the spin of a sphere moves no surface
     drift = plus(drift, -1.0, cross(w, plus(seat, -1.0, place[B])))
     if kind[b] == CAPSULE:
@@ -227,18 +252,20 @@ def _thickness(kind, size, inner):
         thick = min(size[0], size[1], size[2])
     elif kind in (SPHERE, CAPSULE):
         thick = size[0]
+    elif kind >= CONVEX:
+        thick = size[2]
     else:
         thick = size[0] * inner[kind - POLYHEDRON + 1]
     return thick
 
 
 @inlined
-def _vector(row, start):
+def vector_of(row, start):
     return row[start], row[start + 1], row[start + 2]
 
 
 @inlined
-def _after(v, spin, time):
+def after_turn(v, spin, time):
     """The vector v after `time` of turning with the angular velocity `spin`."""
     if dot(v, v) == 0.0:
         return v[0], v[1], v[2]
@@ -255,11 +282,11 @@ def _bend(arm, spin, dt):
     """By how much the mean velocity of the end of an arm that turns for dt differs from that at the start."""
     if dot(spin, spin) == 0.0 or dot(arm, arm) == 0.0:
         return 0.0, 0.0, 0.0
-    return plus(plus(_ZERO, 1.0 / dt, plus(_after(arm, spin, dt), -1.0, arm)), -1.0, cross(spin, arm))
+    return plus(plus(_ZERO, 1.0 / dt, plus(after_turn(arm, spin, dt), -1.0, arm)), -1.0, cross(spin, arm))
 
 
 @inlined
-def _spun(q, spin, time):
+def spun(q, spin, time):
     """The quaternion q after `time` of turning with the angular velocity `spin`."""
     half = 0.5 * time * spin[0], 0.5 * time * spin[1], 0.5 * time * spin[2]
     sine, _ = shares(half)

@@ -125,7 +125,7 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
     while True:
         done, found = _pairs(*first.hulls[2:], *sides, delta, most, done, found, pair, feature, out)
         if done == len(delta):
-            return _manifold(pair[:found], feature[:found], out[:found])
+            return manifold_of(pair[:found], feature[:found], out[:found])
         pair, feature, out = (np.concatenate([column, np.empty_like(column)]) for column in (pair, feature, out))
 
 
@@ -133,7 +133,7 @@ def spheres_polyhedra(ball: Spheres, body: Polyhedra, delta: Floats) -> Manifold
     """One contact, at the closest point; a centre inside is pushed out through the nearest face."""
     pair, out = np.empty(len(delta), np.int64), np.empty((len(delta), 7))
     found = _spheres(*body.hulls[3:-1], *ball, *body.columns(), delta, pair, out)
-    return _manifold(pair[:found], np.zeros(found, np.int64), out[:found])
+    return manifold_of(pair[:found], np.zeros(found, np.int64), out[:found])
 
 
 def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
@@ -141,10 +141,11 @@ def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
     room = len(delta) * body.hulls.vertex.shape[1]
     pair, feature, out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7))
     found = _planes(body.hulls.counts, body.hulls.vertex, *body.columns(), *plane, delta, pair, feature, out)
-    return _manifold(pair[:found], feature[:found], out[:found])
+    return manifold_of(pair[:found], feature[:found], out[:found])
 
 
-def _manifold(pair: Ints, feature: Ints, out: Floats) -> Manifold:
+def manifold_of(pair: Ints, feature: Ints, out: Floats) -> Manifold:
+    """The contacts (k,) whose points, normals and gaps are the columns of `out` (k, 7)."""
     return Manifold(pair, feature, Touch(*(np.ascontiguousarray(c) for c in (out[:, :3], out[:, 3:6], out[:, 6]))))
 
 
@@ -486,27 +487,38 @@ def _distance(p, many, q, others, x, y, z, reach, size, way, ends, share, parts)
         ends[count, 0], ends[count, 1] = i, j
         for n in range(3):
             way[count, n] = q[j, n] - p[i, n]
-        first, second, better = 0, 0, np.inf  # the new simplex: `first`, `second` and the last of the points
-        if count == 0:
-            better = dot(way[0], way[0])
-            parts[0], parts[1], parts[2] = 0.0, 0.0, 1.0
-        elif count == 1:
-            a, b = dot(way[0], way[0]), dot(way[0], way[1])
-            t = min(max((a - b) / (a - 2.0 * b + dot(way[1], way[1])), 0.0), 1.0)
-            parts[0], parts[1], parts[2], better = 1.0 - t, 0.0, t, 0.0
-            for n in range(3):
-                better += ((1.0 - t) * way[0, n] + t * way[1, n]) ** 2
-        else:
-            for one in range(count - 1):
-                for two in range(one + 1, count):
-                    found = _on_triangle(way[one], way[two], way[count], parts[3:])
-                    if found < better:
-                        better, first, second = found, one, two
-                        parts[0], parts[1], parts[2] = parts[3], parts[4], parts[5]
+        many_left, better, u, v, w = nearer(count, square, way, ends, share, parts)
         if not better < square:
             break
-        square, last, count = better, count, 0
-        x, y, z = 0.0, 0.0, 0.0
+        count, square, x, y, z = many_left, better, u, v, w
+    return count, np.sqrt(square)
+
+
+@loop
+def nearer(count, square, way, ends, share, parts):
+    """Make of a simplex of so many points of `way` (4, 3), and of the point that follows them, the part that is nearest
+    to the origin, if it is nearer than `square`: how many points it has, the square of its distance, and its place. The
+    rows `ends` (4, 2) go with the points; their `share` (4,) is filled in."""
+    first, second, better = 0, 0, np.inf  # the new simplex: `first`, `second` and the last of the points
+    if count == 0:
+        better = dot(way[0], way[0])
+        parts[0], parts[1], parts[2] = 0.0, 0.0, 1.0
+    elif count == 1:
+        a, b = dot(way[0], way[0]), dot(way[0], way[1])
+        t = min(max((a - b) / (a - 2.0 * b + dot(way[1], way[1])), 0.0), 1.0)
+        parts[0], parts[1], parts[2], better = 1.0 - t, 0.0, t, 0.0
+        for n in range(3):
+            better += ((1.0 - t) * way[0, n] + t * way[1, n]) ** 2
+    else:
+        for one in range(count - 1):
+            for two in range(one + 1, count):
+                found = _on_triangle(way[one], way[two], way[count], parts[3:])
+                if found < better:
+                    better, first, second = found, one, two
+                    parts[0], parts[1], parts[2] = parts[3], parts[4], parts[5]
+    x, y, z, last = 0.0, 0.0, 0.0, count
+    if better < square:
+        count = 0
         for n in range(3):
             k = first if n == 0 else second if n == 1 else last
             if parts[n] > 0.0:
@@ -514,7 +526,7 @@ def _distance(p, many, q, others, x, y, z, reach, size, way, ends, share, parts)
                 way[count, 0], way[count, 1], way[count, 2] = way[k, 0], way[k, 1], way[k, 2]
                 x, y, z = x + parts[n] * way[k, 0], y + parts[n] * way[k, 1], z + parts[n] * way[k, 2]
                 count += 1
-    return count, np.sqrt(square)
+    return count, better, x, y, z
 
 
 @loop

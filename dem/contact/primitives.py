@@ -10,9 +10,10 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats, Ints
-from dem.bodies import BOX, CAPSULE, CLUMP, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
+from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
 from dem.contact.ahead import Course, hosts_first, seen_from, turn_ahead
 from dem.contact.clumps import Members, members, more_numbers, spread
+from dem.contact.convex import Solids, Supports, arcs_of, solids, solids_planes, solids_solids, supports_of
 from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
 from dem.contact.narrow import (
     Boxes,
@@ -41,7 +42,8 @@ from dem.mesh import Mesh, Surface
 from dem.model.neighbourhood import Neighbourhood
 from dem.motion import Dynamic
 from dem.scene import LargeBody
-from dem.shapes import Shape, placed
+from dem.shapes import CONVEX_SHAPES, Shape, placed
+from dem.shapes.convex import Convex, centred
 from dem.shapes.forms import Form
 
 
@@ -51,19 +53,21 @@ class Primitives(NamedTuple):
 
     number: Ints  #: (n,) of the grain its id, of parts the numbers that follow: the same at all times
     row: Ints  #: (n,) row of the body
-    kind: Ints  #: (n,) SPHERE, BOX, CAPSULE, PLANE, MESH, or POLYHEDRON and the number of the shape
+    kind: Ints  #: (n,) SPHERE, BOX, CAPSULE, PLANE, MESH, or POLYHEDRON or CONVEX and the number of the form
     center: Floats  #: (n, 3); a point of the surface of a half space, the middle of a mesh [m]
     quaternion: Floats  #: (n, 4)
     size: Floats  #: (n, 3) as of `dem.shapes.placed` [m]; the normals of half spaces are those in the world
     radius: Floats  #: (n,) of the sphere about the centre that encloses it, without meaning for half spaces [m]
     surfaces: dict[int, Surface]  #: of the meshes, by row
     hulls: Hulls  #: of boxes and of the polyhedra of the scene
+    supports: Supports  #: of its other convex shapes
     members: Members | None = None  #: the spheres of clumps; None in scenes without
 
     def take(self, rows: Ints) -> Primitives:
         """The primitives of these rows, without meshes and clumps."""
         names = ("number", "row", "kind", "center", "quaternion", "size", "radius")
-        return Primitives(**{name: getattr(self, name)[rows] for name in names}, surfaces={}, hulls=self.hulls)
+        columns = {name: getattr(self, name)[rows] for name in names}
+        return self._replace(**columns, surfaces={}, members=None)
 
     def columns(self) -> tuple[Ints, Ints, Floats, Floats, Floats, Floats, Floats]:
         """What the loops of `dem.contact.ahead` take of it."""
@@ -110,6 +114,11 @@ class Primitives(NamedTuple):
         scale = np.where(hull[:, None] > 0, size[:, :1] / self.hulls.radius[hull, None], size)
         return Polyhedra(self.center[rows], quaternion.matrix(self.quaternion[rows]), scale, hull, self.hulls)
 
+    def solid(self, rows: Any) -> Solids:
+        """Any convex shape."""
+        turn = quaternion.matrix(self.quaternion[rows])
+        return solids(self.kind[rows], self.center[rows], turn, self.size[rows], self.hulls, self.supports)
+
     def capsule(self, rows: Any) -> Capsules:
         axis = quaternion.rotate(self.quaternion[rows], np.array([0.0, 0.0, 1.0]))
         return Capsules(self.center[rows], axis, self.size[rows, 1], self.size[rows, 0])
@@ -131,21 +140,22 @@ def primitives(
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
     parts_of = [shape for body in shapes for shape in body]
     kinds, centers, turns, sizes = zip(*(placed(shape) for shape in parts_of)) if parts_of else [()] * 4
+    numbers = [forms.index(centred(shape)) if isinstance(shape, Convex) else 0 for shape in parts_of]
     center, turn, size = (np.reshape(c, (len(row), k)) for c, k in ((centers, 3), (turns, 4), (sizes, 3)))
     spans = [numbers_of(shape, hulls.features) for shape in parts_of]
     columns = {
         "number": (table.id, grains + np.cumsum([0, *spans])[:-1]),
         "row": (np.arange(count), row),
-        "kind": (table.shape, np.array(kinds, np.int64)),
+        "kind": (table.shape, np.array(kinds, np.int64) + np.array(numbers, np.int64)),
         "center": (table.position, center),
         "quaternion": (table.quaternion, turn),
         "size": (table.size, size),
     }
     after = grains + sum(spans)
-    numbers = after + more_numbers(forms, initial)
-    if numbers > (most := most_numbers(hulls.features)):
+    last = after + more_numbers(forms, initial)
+    if last > (most := most_numbers(hulls.features)):
         raise ValueError(
-            f"{grains} grains and {numbers - grains} numbers of parts of bodies: their contacts have no keys; "
+            f"{grains} grains and {last - grains} numbers of parts of bodies: their contacts have no keys; "
             f"allowed are {most} together"
         )
     both = {name: np.concatenate([of_grains[:count], of_parts]) for name, (of_grains, of_parts) in columns.items()}
@@ -154,6 +164,7 @@ def primitives(
         radius=enclosing_radius(both["kind"], both["size"]),
         surfaces={count + n: shape.surface for n, shape in enumerate(parts_of) if isinstance(shape, Mesh)},
         hulls=hulls,
+        supports=supports_of(forms),
         members=members(table.take(slice(0, count)), forms, after),
     )
 
@@ -195,7 +206,7 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
     i, j, delta = i[others], j[others], delta[others]
     swap = hosts_first(table.kind[i], table.kind[j])
     guest, host = np.where(swap, j, i), np.where(swap, i, j)
-    kind = np.where(table.kind >= POLYHEDRON, _POLYHEDRON, table.kind)
+    kind = np.where(table.kind >= POLYHEDRON, np.where(table.kind >= CONVEX, _CONVEX, _POLYHEDRON), table.kind)
     code = 8 * kind[guest] + kind[host]
     for kinds in map(int, np.flatnonzero(np.bincount(code))):
         if divmod(kinds, 8) in _TOUCH:
@@ -212,7 +223,10 @@ def touches_ahead(
     """The contacts as `turn_ahead` gives them directions of the end of a step, and what this returns of them. A deep
     gap is no deeper than the pair overlaps at the start, and none is wider than `delta` there."""
     found = touches(table, i, j, delta, course)
-    moved, swing, linear, deep = turn_ahead(*table.columns(), *course, i, j, found.pair, *found.touch)
+    given, arcs = (*table.columns(), *course, i, j, found.pair, *found.touch), np.zeros((0, 4, 3))
+    if (table.kind >= CONVEX).any():
+        arcs = arcs_of(*given, *table.supports[:3])
+    moved, swing, linear, deep = turn_ahead(*given, arcs)
     if len(deep):
         pairs, row = np.unique(found.pair[deep], return_inverse=True)
         now, least = touches(table, i[pairs], j[pairs], delta[pairs]), delta[pairs]
@@ -234,7 +248,8 @@ def _touching(
         center, turn, way = seen_from(*table.columns(), *course, i, j)
         guests, delta = guests._replace(center=center, quaternion=turn), delta + way
     if second is not None:
-        return contacts(first(guests, slice(None)), second(table, j), delta)
+        further = (table.hulls,) if first is Primitives.solid or second is Primitives.solid else ()
+        return contacts(first(guests, slice(None)), second(table, j), delta, *further)
     found = []
     for mesh in np.unique(j):
         rows = np.flatnonzero(j == mesh)
@@ -243,8 +258,8 @@ def _touching(
     return joined(found)
 
 
-#: The kind of polyhedra that are no boxes, in pairs: clumps are their spheres there.
-_POLYHEDRON = CLUMP
+#: The kinds of polyhedra that are no boxes, and of other convex shapes, in pairs: clumps are their spheres there.
+_POLYHEDRON, _CONVEX = CLUMP, CLUMP + 1
 
 #: For pairs of kinds, of guest and host (`dem.contact.ahead.RANK`), the contacts, and what these take of each of the
 #: two; None: mesh by mesh.
@@ -262,6 +277,9 @@ _TOUCH: dict[tuple[int, int], tuple[Callable[..., Manifold], Callable[..., Any],
     (SPHERE, _POLYHEDRON): (spheres_polyhedra, Primitives.sphere, Primitives.polyhedron),
     (BOX, PLANE): (polyhedra_planes, Primitives.polyhedron, Primitives.plane),
     (_POLYHEDRON, PLANE): (polyhedra_planes, Primitives.polyhedron, Primitives.plane),
+    **{(kind, _CONVEX): (solids_solids, Primitives.solid, Primitives.solid) for kind in (SPHERE, CAPSULE, _CONVEX)},
+    **{(_CONVEX, kind): (solids_solids, Primitives.solid, Primitives.solid) for kind in (BOX, _POLYHEDRON)},
+    (_CONVEX, PLANE): (solids_planes, Primitives.solid, Primitives.plane),
     (SPHERE, MESH): (sphere_mesh, Primitives.sphere, None),
     (CAPSULE, MESH): (capsule_mesh, Primitives.capsule, None),
     (PLANE, MESH): (plane_mesh, Primitives.plane, None),
@@ -270,6 +288,7 @@ _TOUCH: dict[tuple[int, int], tuple[Callable[..., Manifold], Callable[..., Any],
 #: What messages call the kinds of pairs.
 _NAMES = {
     SPHERE: "spheres", BOX: "boxes", CAPSULE: "capsules", _POLYHEDRON: "polyhedra", PLANE: "planes", MESH: "meshes",
+    _CONVEX: " or ".join(f"{shape.__name__.lower()}s" for shape in CONVEX_SHAPES),
 }  # fmt: skip
 
 
@@ -281,14 +300,17 @@ def _can_touch(one: int, other: int) -> bool:
 
 def _in_pairs(kind: int) -> int:
     """The kind that stands for one in `_TOUCH`; that of clumps is the one of their spheres."""
-    return _POLYHEDRON if kind >= POLYHEDRON else SPHERE if kind >= CLUMP else kind
+    if kind >= CLUMP:
+        return _CONVEX if kind >= CONVEX else _POLYHEDRON if kind >= POLYHEDRON else SPHERE
+    return kind
 
 
 def refuse_untouchable(grains: Sequence[int], large_bodies: Sequence[LargeBody]) -> None:
     """ValueError for kinds of grains, and shapes of large bodies, that might meet and have no contacts."""
     of_grains = [(f"grains that are {_NAMES[kind]}", kind) for kind in sorted({_in_pairs(kind) for kind in grains})]
     pairs = list(combinations_with_replacement(of_grains, 2))
-    shapes = [[(f"the {type(s).__name__.lower()} of {b.name!r}", placed(s)[0]) for s in b.shapes] for b in large_bodies]
+    shapes = [[(f"the {type(s).__name__.lower()} of {b.name!r}", _in_pairs(placed(s)[0])) for s in b.shapes]
+              for b in large_bodies]
     pairs += [(grain, part) for parts in shapes for part in parts for grain in of_grains]
     moves = [isinstance(body.motion, Dynamic) for body in large_bodies]
     for one, other in combinations(range(len(shapes)), 2):

@@ -146,7 +146,7 @@ def _apart(world: World, center: Floats, radius: Floats) -> Bools:
     )  # fmt: skip
     every = bodies.concatenate([table, world.large])
     near = Neighbourhood(every, np.zeros(count), np.arange(len(every)), count, 0)
-    parts = primitives(near, [body.shapes for body in world.large_bodies], count).now(near)
+    parts = primitives(near, [body.shapes for body in world.large_bodies], count, world.forms).now(near)
     i, j = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for part in range(count, len(parts.kind)):
         way = center - parts.center[part]

@@ -10,9 +10,12 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
-from dem.bodies import BOX, CAPSULE, MESH, PLANE, SPHERE
+from dem.bodies import BOX, CAPSULE, CONVEX, MESH, PLANE, SPHERE
 from dem.checks import check_fields, finite, positive, rows, unit_quaternion, unit_vector, vector
 from dem.mesh import Mesh
+from dem.shapes.convex import Convex, centred
+from dem.shapes.cylinder import Cylinder
+from dem.shapes.superellipsoid import Superellipsoid
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,10 @@ class Capsule:
         check_fields(self, radius=positive, half_length=positive, center=vector, quaternion=unit_quaternion)
 
 
-Shape = Union[Plane, Box, Sphere, Capsule, Mesh]
+#: The kinds of convex shapes that are known by their support functions.
+CONVEX_SHAPES: tuple[type[Convex], ...] = (Cylinder, Superellipsoid)
+
+Shape = Union[Plane, Box, Sphere, Capsule, Mesh, Convex]
 
 
 @dataclass(frozen=True)
@@ -90,12 +96,14 @@ def described(shape: Shape) -> dict[str, Any]:
     if isinstance(shape, Mesh):
         names = ("vertices", "triangles", "center", "quaternion")
         return {"kind": "Mesh", **{name: np.asarray(getattr(shape, name)).tolist() for name in names}}
-    return {"kind": type(shape).__name__, **asdict(shape)}
+    surface = centred(shape).described() if isinstance(shape, Convex) else {}
+    return {"kind": type(shape).__name__, **asdict(shape), **surface}
 
 
 def placed(shape: Shape) -> tuple[int, Floats, Floats, Floats]:
     """Kind, centre (3,), quaternion (4,) and size (3,), as of `Bodies`, of a shape in the frame of its body; of a mesh
-    those of the box about it, and as the size of a half space its normal."""
+    those of the box about it, and as the size of a half space its normal. The kind of a convex shape is CONVEX, without
+    the number of its form."""
     center, turn = np.array(shape.center), np.array(getattr(shape, "quaternion", (1.0, 0.0, 0.0, 0.0)))
     if isinstance(shape, Plane):
         return PLANE, center, turn, np.array(shape.normal)
@@ -105,6 +113,8 @@ def placed(shape: Shape) -> tuple[int, Floats, Floats, Floats]:
         return BOX, center, turn, np.array(shape.half_extents)
     if isinstance(shape, Capsule):
         return CAPSULE, center, turn, np.array([shape.radius, shape.half_length, 0.0])
+    if isinstance(shape, Convex):
+        return CONVEX, center, turn, centred(shape).size
     return MESH, center + quaternion.rotate(turn, shape.surface.middle), turn, shape.surface.half
 
 
@@ -136,6 +146,9 @@ def solid_properties(shape: Shape, density: float) -> tuple[float, Floats, Float
     if isinstance(shape, Mesh):
         volume, center, tensor = shape.solid()
         return density * volume, np.array(shape.center) + frame @ center, density * frame @ tensor @ frame.T
+    if isinstance(shape, Convex):
+        form = centred(shape)
+        return density * form.volume, place, density * (frame * form.moments) @ frame.T
     mass, moments = solid(kind, size[None], np.array([density]))
     return float(mass[0]), place, (frame * moments[0]) @ frame.T
 

@@ -26,7 +26,6 @@ if tuple(map(int, vtkVersion.GetVTKVersion().split(".")[:2])) < (9, 4):  # as De
 
 MARGIN = 0.06  # how far walls go beyond the scene, in diagonals of the scene
 HOLLOW = 0.2  # a hollow body is empty up to this part of the way from its middle to its bounds
-SOLID = ("Box", "Capsule", "Mesh", "Sphere")
 SHARE = 0.25  # part of the grains within the bounds of a hollow body
 
 
@@ -68,10 +67,11 @@ class Scene:
         corners += [wall.center[None] for frame in frames for row in self._hollow for wall in self._boxes(frame, row)]
         self.box = _bounds(corners)
 
-    def surface(self, frame: Frame, row: int, kinds: Collection[str] = SOLID) -> vtkPolyData:
+    def surface(self, frame: Frame, row: int, kinds: Collection[str] = ()) -> vtkPolyData:
         """The surface of a large body, or of its shapes of some kinds, without its planes."""
-        pose = self._pose(frame, row)
-        return joined(_placed(shape, *pose) for shape in self.folder.large[row]["shapes"] if shape["kind"] in kinds)
+        pose, shapes = self._pose(frame, row), self.folder.large[row]["shapes"]
+        wanted = (shape for shape in shapes if (shape["kind"] in kinds if kinds else shape["kind"] != "Plane"))
+        return joined(_placed(shape, *pose) for shape in wanted)
 
     def tools(self, frame: Frame) -> vtkPolyData:
         """The surfaces of all tools."""
@@ -269,7 +269,7 @@ def _placed(shape: Mapping[str, Any], place: np.ndarray, turn: np.ndarray) -> vt
 
 def _surface(shape: Mapping[str, Any]) -> vtkPolyData:
     """The surface of a shape of a large body, in the frame of the shape."""
-    if shape["kind"] == "Mesh":
+    if "triangles" in shape:
         return polydata(np.array(shape["vertices"])[np.ravel(shape["triangles"])], "polys", 3)
     if shape["kind"] == "Capsule":
         return cylinder(shape["radius"], 2 * shape["half_length"], caps=True)

@@ -1,0 +1,115 @@
+"""Cylinders and superellipsoids roll, stand, tip and rock as mechanics says, on any number of ranks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import pctt
+from dem.scene import Scene
+from dem.shapes import Box, Cylinder, Plane, Superellipsoid
+
+G = 9.81
+ACROSS = (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)  # the axis along y
+FLOORS = {"plane": Plane((0, 0, 1)), "box": Box((9, 9, 1), (0, 0, -1))}
+
+
+def on_floor(floor, friction, slope=0.0, way=0.0):
+    """A scene with a floor at z = 0, inclined in the direction of an angle."""
+    down = np.sin(slope) * np.array([np.cos(way), np.sin(way)])
+    scene = Scene(friction, gravity=(G * down[0], G * down[1], -G * np.cos(slope)))
+    scene.add_body("floor", [FLOORS[floor]])
+    return scene
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_a_cylinder_rolls_down_at_two_thirds_of_what_slides(floor):
+    slope, r = 0.4, 0.12
+    scene = on_floor(floor, 0.7, slope)
+    scene.add_grains([(0, 0, r)], Cylinder(r, 0.3), 800.0, quaternions=ACROSS)
+    with pctt.Simulation(scene, dt=4e-3, tol=1e-8) as sim:
+        sim.run(steps=100)
+        way, speed = 2 / 3 * G * np.sin(slope) * np.array([0.5 * 0.4**2, 0.4])
+        velocity = sim.local.velocity[0]
+        np.testing.assert_allclose(velocity[[0, 1, 4]], [speed, 0, speed / r], rtol=1e-3, atol=1e-3)
+        assert sim.positions[0, 0] == pytest.approx(way, rel=0.02)  # to first order in dt
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_a_cylinder_stands_without_creep(floor):
+    r, length = 0.1, 0.35
+    scene = on_floor(floor, 0.5, 0.2, 0.7)
+    scene.add_grains([(0, 0, length / 2)], Cylinder(r, length), 1200.0)
+    with pctt.Simulation(scene, dt=5e-3, tol=1e-9) as sim:
+        sim.run(steps=60)
+        before = sim.positions[0]
+        sim.run(steps=60)
+        weight = 1200.0 * np.pi * r**2 * length * G
+        np.testing.assert_allclose(np.linalg.norm(sim.body("floor").force), weight, rtol=1e-5)
+        np.testing.assert_allclose(sim.positions[0], before, atol=1e-7)
+
+
+@pytest.mark.parametrize(("share", "falls"), [(0.95, False), (1.05, True)])
+@pytest.mark.parametrize("way", [0.1, np.pi / 6])  # towards a point that bears, and between two
+def test_a_cylinder_tips_where_its_weight_leaves_its_end(share, falls, way):
+    r, length = 0.1, 0.4
+    scene = on_floor("plane", 2.0, share * np.arctan(2 * r / length), way)
+    scene.add_grains([(0, 0, length / 2)], Cylinder(r, length), 1000.0)
+    with pctt.Simulation(scene, dt=5e-3, tol=1e-8) as sim:
+        sim.run(steps=80)
+        tilt = 2.0 * np.hypot(*sim.orientations[0, 1:3])
+        assert tilt > 0.1 if falls else tilt < 0.01
+
+
+def test_an_ellipsoid_rocks_with_the_period_of_its_curvature():
+    """On its short axis c, in the plane of a: R = a^2/c is the radius below, omega^2 = m g (R - c) / (I + m c^2)."""
+    a, b, c, start = 0.3, 0.25, 0.2, 0.05
+    scene = on_floor("plane", 3.0)
+    height = np.hypot(c * np.cos(start), a * np.sin(start))
+    turn = (np.cos(start / 2), 0, np.sin(start / 2), 0)
+    scene.add_grains([(0, 0, height)], Superellipsoid((a, b, c)), 1000.0, quaternions=turn)
+    omega = np.sqrt(G * (a**2 / c - c) / ((a**2 + c**2) / 5 + c**2))
+    dt, signs, tilts = 4e-3, [], []
+    with pctt.Simulation(scene, dt=dt, tol=1e-9) as sim:
+        for _ in range(int(2 * np.pi / omega / dt) + 10):
+            sim.step()
+            signs.append(sim.local.velocity[0, 4])
+            tilts.append(2 * sim.orientations[0, 2])
+    turns = np.flatnonzero(np.diff(np.sign(signs[2:]))) + 2
+    ends = [k + signs[k] / (signs[k] - signs[k + 1]) for k in turns]
+    assert (ends[0] + 0.5) * dt == pytest.approx(np.pi / omega, rel=0.02)
+    assert (ends[1] - ends[0]) * dt == pytest.approx(np.pi / omega, rel=0.02)
+    assert min(tilts) == pytest.approx(-start, rel=0.1)
+    assert tilts[turns[1]] == pytest.approx(start, rel=0.15)
+
+
+def bed(side, layers):
+    """Cylinders, superellipsoids, balls, boxes and capsules above a box of walls."""
+    rng, wide = np.random.default_rng(11), 0.25
+    place = np.stack(np.meshgrid(*[np.arange(side)] * 2, np.arange(layers), indexing="ij"), axis=-1).reshape(-1, 3)
+    place, turns = wide * (place + 0.5), rng.normal(size=(len(place), 4))
+    scene = Scene(0.4)
+    walls = [Plane((0, 0, 1)), Plane((1, 0, 0)), Plane((0, 1, 0))]
+    scene.add_body("box", [*walls, Plane((-1, 0, 0), (wide * side, 0, 0)), Plane((0, -1, 0), (0, wide * side, 0))])
+    for k, shape in enumerate((Cylinder(0.08, 0.16), Superellipsoid((0.12, 0.09, 0.07)), Cylinder(0.1, 0.06),
+                               Superellipsoid((0.08, 0.08, 0.07), (5, 5)))):  # fmt: skip
+        at = slice(k, None, 6)
+        scene.add_grains(place[at], shape, 1500.0, scale=rng.uniform(0.8, 1.0, len(place[at])), quaternions=turns[at])
+    scene.add_spheres(place[4::6], 0.09, 1500.0)
+    scene.add_boxes(place[5::12], (0.08, 0.07, 0.05), 1500.0, quaternions=turns[5::12])
+    scene.add_capsules(place[11::12], 0.06, 0.05, 1500.0, quaternions=turns[11::12])
+    return scene
+
+
+@pytest.mark.parallel(2)
+def test_ranks_agree():
+    given = {"dt": 4e-3, "tol": 1e-8, "solver": "apgd", "stiffness": 1e6}
+    with pctt.Simulation(bed(2, 3), comm=MPI.COMM_WORLD, **given) as sim:
+        sim.run(steps=50)
+        place, many = sim.positions, len(sim.contacts)
+    with pctt.Simulation(bed(2, 3), comm=MPI.COMM_SELF, **given) as alone:
+        alone.run(steps=50)
+        assert len(alone.contacts) > 10
+        np.testing.assert_allclose(alone.positions, place, atol=1e-5)
+        assert many == len(alone.contacts)
