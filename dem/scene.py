@@ -104,7 +104,7 @@ class Part:
 
     count: int
     kind: int
-    material: int
+    material: int | Ints  #: of all, or (count,)
     given: dict[str, Column]
     #: from the columns of `given`: position, quaternion, size, mass and inertia, as of `Bodies`
     solid: Callable[[dict[str, Floats]], tuple[Floats, ...]]
@@ -120,7 +120,7 @@ class Part:
             velocity=np.hstack([given["velocity"], given["angular velocity"]]),
             mass=mass,
             inertia=inertia,
-            material=np.full(many, self.material),
+            material=np.full(many, self.material if isinstance(self.material, int) else self.material[first:end]),
             shape=np.full(many, self.kind),
             size=size,
             weight=np.zeros(many),
@@ -194,14 +194,15 @@ class Scene:
         radius: ArrayLike,
         density: ArrayLike,
         *,
-        material: str = "default",
+        material: str | Sequence[str] = "default",
         velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
     ) -> Ints | range:
         """Add solid spheres and return their ids (n,).
 
-        positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3). What has a
-        row for each sphere may be a `dem.arrays.Rule`, of which every rank makes its part alone; so of other grains.
+        positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3); the name
+        of a material, or (n,) names. What has a row for each sphere may be a `dem.arrays.Rule`, of which every rank
+        makes its part alone; so of other grains. `pctt.beds.read_spheres` has these arguments from a file.
         """
         upright, lengths = (1.0, 0.0, 0.0, 0.0), {"radius": radius}
         return self._add_grains(SPHERE, positions, lengths, density, material, upright, velocity, angular_velocity)
@@ -574,7 +575,8 @@ class Scene:
         return self._materials.setdefault(name, len(self._materials))
 
     def _add_grains(
-        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike, material: str,
+        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike,
+        material: str | Sequence[str],
         quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
     ) -> Ints | range:  # fmt: skip
         """Add grains of one kind, of which `lengths` has the columns of `size` by name; their ids."""
@@ -611,7 +613,8 @@ class Scene:
         )
 
     def _append(
-        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike, material: str,
+        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike,
+        material: str | Sequence[str],
         quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
         solid: Callable[[dict[str, Floats]], tuple[Floats, ...]],
     ) -> Ints | range:  # fmt: skip
@@ -629,7 +632,11 @@ class Scene:
             Column.of("angular velocity", angular_velocity, count, 3),
         ]
         given = {column.name: column for column in columns}
-        self.parts.append(Part(count, kind, self._material(material), given, solid))
+        if not isinstance(material, str) and len(material) != count:
+            raise ValueError(f"material must be one name or {count} names, got {len(material)}")
+        number = {name: self._material(name) for name in ((material,) if isinstance(material, str) else material)}
+        numbers = number[material] if isinstance(material, str) else np.array([number[name] for name in material])
+        self.parts.append(Part(count, kind, numbers, given, solid))
         self._survey = None
         ids = range(first, first + count)
         return ids if isinstance(positions, Rule) else np.array(ids, np.int64)

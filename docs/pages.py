@@ -33,8 +33,8 @@ PARTS = {
     "Simulations and their results": ["pctt", "pctt.simulation", "pctt.folder", "pctt.analysis", "dem.measures"],
     "What a scene is made of": [
         "dem.scene", "dem.shapes", "dem.mesh", "dem.motion", "dem.parts.contact_law", "dem.parts.loads",
-        "dem.parts.springs", "dem.parts.joints", "dem.parts.sources", "dem.packing", "dem.experiment", "pctt.scenes",
-        "dem.start.stiffness", "dem.start.time_step", "dem.checks", "dem.record.analysis",
+        "dem.parts.springs", "dem.parts.joints", "dem.parts.sources", "dem.packing", "pctt.beds", "dem.experiment",
+        "pctt.scenes", "dem.start.stiffness", "dem.start.time_step", "dem.checks", "dem.record.analysis",
     ],
     "What a time step is made of": [
         "dem.start", "dem.model.world", "dem.bodies", "dem.unconstrained", "dem.contact", "dem.step.system",
@@ -48,6 +48,7 @@ PARTS = {
 #: What is public of modules that define helpers of other modules too.
 ONLY = {
     "pctt.simulation": ["Body"],
+    "pctt.beds": ["read_spheres"],
     "dem.scene": ["LargeBody", "Scene"],
     "dem.unconstrained": ["UnconstrainedMotion", "unconstrained"],
     "dem.mesh": ["Mesh"],

@@ -117,7 +117,7 @@ class Simulation:
         if restart:
             self.world, self.memory = state.load(Path(restart), scene, self._origin, comm)
         else:
-            self.world = state.world_at_start(self.experiment, scene, comm)
+            self.world = state.world_at_start(self.experiment, self.settings, scene, comm)
             self.memory = ImpulseMemory(comm, self.world.pairs.parts)
         falls = "" if restart else comm.bcast(fall_remark(scene, self.settings.dt))
         if large := step_remark(self.world, self.settings.dt) or falls:

@@ -27,7 +27,7 @@ from dem.model.world import World
 from dem.quaternion import cross
 from dem.scene import LargeBody, Scene
 from dem.shapes import placed
-from dem.start import even_slice, new_world, restart_rows, restored_world, stiffness, time_step
+from dem.start import even_slice, new_world, refuse_overlap, restart_rows, restored_world, stiffness, time_step
 from dem.step.impulses import ImpulseMemory
 from dem.together import SceneError, together, unlike
 from pctt import ccp
@@ -35,7 +35,8 @@ from pctt.disk import FileError, Lock, on_first, read, same_rows, texts, write_r
 from pctt.options import OptionError
 from pctt.petsc import warn
 from pctt.run import interrupt
-from pctt.run.settings import Settings, scene_name
+from pctt.run.relax import relax
+from pctt.run.settings import RELAX, Settings, scene_name
 from pctt.run.stepper import Stepper
 
 CONTACTS = ("contacts/key", "contacts/impulse")  #: the data sets that have a row for each contact
@@ -69,9 +70,10 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     motions = [(body.name, type(body.motion).__name__) for body in large]
     words: list[Any] = [scene.materials, sorted(scene.leaving), list(scene.loads), list(scene.springs), motions]
     words += [repr(scene.sources), repr(scene.outlets)]
-    words.append([(part.count, part.kind, part.material) for part in scene.parts])
+    words.append([(part.count, part.kind) for part in scene.parts])
     words.append([(name, repr(joint)) for name, joint in scene.joints.items()])
     numbers: list[Any] = [column.sample() for part in scene.parts for column in part.given.values()]
+    numbers += [part.material for part in scene.parts]
     numbers += scene.large().columns().values()
     numbers += [value for body in large for shape in body.shapes for value in placed(shape)]
     numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values(), *(body.surface for body in large)]
@@ -84,12 +86,22 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     return repr(words), [value for value in map(np.asarray, numbers) if value.dtype.kind in "fiub"]
 
 
-def world_at_start(experiment: Experiment, scene: Scene, comm: MPI.Comm) -> World:
+def world_at_start(experiment: Experiment, settings: Settings, scene: Scene, comm: MPI.Comm) -> World:
     """What the experiment built, at time zero; OptionError if it cannot start so."""
+    name = type(experiment).__name__
     try:
-        return new_world(scene, comm)
+        world = new_world(scene, comm, math.inf)
     except (ValueError, FloatingPointError) as error:  # the latter of velocities whose squares overflow
-        raise OptionError(f"scene {type(experiment).__name__}: {error}") from None
+        raise OptionError(f"scene {name}: {error}") from None
+    if settings.overlap == RELAX:
+        relax(world, scene, settings)
+        return world
+    try:
+        refuse_overlap(world, float(settings.overlap))
+    except ValueError as error:
+        helps = "-overlap relax opens overlaps before the first step, a number allows greater ones"
+        raise OptionError(f"scene {name}: {error}. What helps: {helps}") from None
+    return world
 
 
 # -- checkpoints ---------------------------------------------------------------------------------------------
@@ -223,6 +235,8 @@ def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_
         "stiffness": stiffness.pairs(scene).stiffness.tolist(),
         "tol": settings.settle_tol,
     }
+    if settings.overlap != Settings.overlap:
+        how["overlap"] = settings.overlap
     if experiment.digest:
         how["file"] = experiment.digest  # a file that was changed may build another scene
     if surfaces := json.loads(made_with["surfaces"]):
@@ -296,7 +310,9 @@ def _settle(
     end = math.ceil(experiment.settling_time / dt * (1 - 1e-12))
     tenth, tol, begun = max(1, end // 10), settings.settle_tol, time.perf_counter()
     say(f"settling {scene_name(experiment)}, {end} steps with APGD to {tol:g}:")
-    world = world_at_start(experiment, scene, comm)
+    loose = Settings(dt=dt, delta=falling, solver="apgd", tol=tol, law=ccp.RELAXATION, overlap=settings.overlap)
+    loose = loose.of(experiment)
+    world = world_at_start(experiment, loose, scene, comm)
     memory = ImpulseMemory(comm, world.pairs.parts)
     if comm.bcast(unfinished(path).exists()):
         try:
@@ -304,7 +320,6 @@ def _settle(
             say(f"  goes on after step {world.step}, from {unfinished(path)}")
         except FileError as error:
             say(f"  {error}; settled from the beginning")
-    loose = Settings(dt=dt, delta=falling, solver="apgd", tol=tol, law=ccp.RELAXATION).of(experiment)
     with Stepper(loose, world, memory) as stepper:
         while world.step < end:
             if world.step + 1 >= end - end // 10:
