@@ -183,6 +183,13 @@ class Scene:
         self.outlets: dict[str, Outlet] = {}  #: by name
         self.joints: dict[str, Joint] = {}  #: by name
 
+    def __repr__(self) -> str:
+        parts = [f"{self.count} grains", f"{len(self.large_bodies)} large bodies"]
+        parts[1] += "".join(f", {body.name!r}" for body in self.large_bodies[:5])
+        for what in ("loads", "springs", "joints", "sources"):
+            parts += [f"{len(members)} {what}" for members in [getattr(self, what)] if members]
+        return f"<Scene: {'; '.join(parts)}; friction {self._law.friction:g}>"
+
     @property
     def deforms(self) -> bool:
         """Whether the periods of the cell change, by a stress or a strain rate."""

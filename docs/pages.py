@@ -70,9 +70,9 @@ def public(name: str) -> dict[str, Any]:
 
 
 def homes() -> dict[str, Any]:
-    """All public classes and functions by their full names, of each the first."""
+    """All public classes and functions by their full names, of each the first; `pctt` has names of all others, too."""
     found: dict[str, Any] = {}
-    for module in (name for names in PARTS.values() for name in names):
+    for module in sorted((name for names in PARTS.values() for name in names), key=lambda name: name == "pctt"):
         for key, value in public(module).items():
             if (inspect.isclass(value) or inspect.isfunction(value)) and value not in found.values():
                 found[f"{module}.{key}"] = value
@@ -139,7 +139,7 @@ def reference() -> Iterator[tuple[str, str]]:
                     yield home, class_page(home, code, *done.get(code, ("", 0.0)))
             elif inspect.isfunction(inspect.unwrap(value)):  # also of one that is compiled
                 functions.append(f".. autofunction:: {module}.{key}")
-            else:
+            elif not inspect.ismodule(value):
                 values = [value] if isinstance(value, str) else value
                 constants.append(f"| `{key}` | {', '.join(f'`{one}`' for one in values)} |")
         text = [f"# `{module}`", "```{eval-rst}", f".. automodule:: {module}", "   :no-members:", "```", ""]

@@ -500,6 +500,11 @@ class Body:
     def __init__(self, sim: Simulation, row: int):
         self._sim, self._row = sim, row
 
+    def __repr__(self) -> str:
+        place = ", ".join(f"{x:.4g}" for x in self.position)
+        speed = float(np.linalg.norm(self.velocity[:3]))
+        return f"<Body {self.name!r}: {type(self.motion).__name__}, at ({place}) m, {speed:.4g} m/s>"
+
     @property
     def name(self) -> str:
         return self._large.name
