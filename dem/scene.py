@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Union
 
 import numpy as np
@@ -583,17 +584,10 @@ class Scene:
 
     def _add_grains(
         self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike,
-        material: str | Sequence[str],
-        quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
+        material: str | Sequence[str], quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
     ) -> Ints | range:  # fmt: skip
         """Add grains of one kind, of which `lengths` has the columns of `size` by name; their ids."""
-
-        def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
-            size = np.zeros((len(given["density"]), 3))
-            for k, name in enumerate(lengths):
-                size[:, slice(None) if kind == BOX else k] = given[name]
-            return given["positions"], _unit(given["quaternions"]), size, *shapes.solid(kind, size, given["density"])
-
+        solid = partial(_plain, kind, tuple(lengths))
         return self._append(
             kind, positions, lengths, density, material, quaternions, velocity, angular_velocity, solid
         )
@@ -606,14 +600,7 @@ class Scene:
         ids."""
         if form not in self.forms:
             self.forms.append(form)
-
-        def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
-            turns, rho, times = _unit(given["quaternions"]), given["density"][:, None], given["scale"][:, None]
-            centers = given["positions"] + quaternion.rotate(turns, times * form.place)
-            turns = quaternion.multiply(turns, np.tile(form.turn, (len(rho), 1)))
-            mass, inertia = (rho * times**3 * form.volume)[:, 0], rho * times**5 * form.moments
-            return centers, turns, times * form.size, mass, inertia
-
+        solid = partial(_formed, form)
         kind = form.BASE + self.forms.index(form)
         return self._append(
             kind, positions, {"scale": scale}, density, material, quaternions, velocity, angular_velocity, solid
@@ -621,8 +608,7 @@ class Scene:
 
     def _append(
         self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike,
-        material: str | Sequence[str],
-        quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
+        material: str | Sequence[str], quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
         solid: Callable[[dict[str, Floats]], tuple[Floats, ...]],
     ) -> Ints | range:  # fmt: skip
         """Add grains of one kind; their ids, a range where the positions are a `Rule`."""
@@ -641,12 +627,29 @@ class Scene:
         given = {column.name: column for column in columns}
         if not isinstance(material, str) and len(material) != count:
             raise ValueError(f"material must be one name or {count} names, got {len(material)}")
-        number = {name: self._material(name) for name in ((material,) if isinstance(material, str) else material)}
-        numbers = number[material] if isinstance(material, str) else np.array([number[name] for name in material])
+        one = isinstance(material, str)
+        numbers = self._material(str(material)) if one else np.array([self._material(name) for name in material])
         self.parts.append(Part(count, kind, numbers, given, solid))
         self._survey = None
         ids = range(first, first + count)
         return ids if isinstance(positions, Rule) else np.array(ids, np.int64)
+
+
+def _plain(kind: int, lengths: tuple[str, ...], given: dict[str, Floats]) -> tuple[Floats, ...]:
+    """`Part.solid` of spheres, boxes and capsules, of which `lengths` are the columns of `size` by name."""
+    size = np.zeros((len(given["density"]), 3))
+    for k, name in enumerate(lengths):
+        size[:, slice(None) if kind == BOX else k] = given[name]
+    return given["positions"], _unit(given["quaternions"]), size, *shapes.solid(kind, size, given["density"])
+
+
+def _formed(form: Form, given: dict[str, Floats]) -> tuple[Floats, ...]:
+    """`Part.solid` of grains of a form."""
+    turns, rho, times = _unit(given["quaternions"]), given["density"][:, None], given["scale"][:, None]
+    centers = given["positions"] + quaternion.rotate(turns, times * form.place)
+    turns = quaternion.multiply(turns, np.tile(form.turn, (len(rho), 1)))
+    mass, inertia = (rho * times**3 * form.volume)[:, 0], rho * times**5 * form.moments
+    return centers, turns, times * form.size, mass, inertia
 
 
 def _unit(quaternions: Floats) -> Floats:

@@ -83,7 +83,7 @@ class Simulation:
         settings: Settings | None = None,
         *,
         comm: MPI.Comm = MPI.COMM_WORLD,
-        restart: str | Path = "",
+        restart: str | Path | state.Kept = "",
         compare: ccp.Comparison | None = None,
         say: Callable[[str], object] = print,
         program: bool = False,
@@ -114,7 +114,9 @@ class Simulation:
         if restart == "settled":
             restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
         self._origin = state.origin(self.experiment, scene, self.settings.dt)
-        if restart:
+        if isinstance(restart, state.Kept):
+            self.world, self.memory = state.restored(restart, scene, comm)
+        elif restart:
             self.world, self.memory = state.load(Path(restart), scene, self._origin, comm)
         else:
             self.world = state.world_at_start(self.experiment, self.settings, scene, comm)
@@ -124,7 +126,8 @@ class Simulation:
             warn(comm, large)
         self._turns = TurnWatch()
         self._tell_turns()
-        self.restart = str(restart)  #: the file from which it goes on
+        self._begun = restart
+        self.restart = "" if isinstance(restart, state.Kept) else str(restart)  #: the file from which it goes on
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
         watch = OverlapWatch(scene, self.settings, float(self.world.pairs.stiffness.min()))
@@ -140,6 +143,31 @@ class Simulation:
         """The simulation that `save` kept, or a checkpoint.h5 of a run, with the same scene and time step; the other
         arguments are those of a new one. On as many ranks it goes on with the same bits."""
         return cls(scene, *given, restart=path, **more)
+
+    def copy(self) -> Simulation:
+        """Another simulation in the same state, which goes on with the same bits, and writes no files; collective."""
+        kept = state.kept(self.world, self.memory)
+        other = Simulation(self.experiment, self.settings, comm=self.comm, restart=kept, compare=self._compare)
+        other.last, other.figures = self.last, dict(self.figures)
+        return other
+
+    def reset(self) -> None:
+        """Go back to where the simulation began: time zero, or its checkpoint; collective. OptionError while `write`
+        writes files."""
+        if self.output is not None:
+            raise OptionError(f"reset: this simulation writes to {self.output.place.folder}; allowed is a new one")
+        fresh = Simulation(
+            self.experiment, self.settings, comm=self.comm, restart=self._begun, compare=self._compare,
+            program=self._program,
+        )  # fmt: skip
+        self.stepper.destroy()
+        vars(self).update(vars(fresh))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For pickle: what `copy` takes, of a simulation of one rank; it wakes up on one rank, too."""
+        if self.comm.size > 1:
+            raise TypeError(f"pickle of a simulation on {self.comm.size} ranks: allowed are one rank, or save and load")
+        return _revived, (self.experiment, self.settings, state.kept(self.world, self.memory))
 
     def __enter__(self) -> Simulation:
         return self
@@ -161,6 +189,9 @@ class Simulation:
         except NoSolutionError:
             if output:
                 output.keep()
+            raise
+        except KeyboardInterrupt:
+            self.world.lists = None  # those of the search may be half made
             raise
         with log.phase("output"):
             row = recording.row(made.step, self.experiment)
@@ -192,8 +223,8 @@ class Simulation:
 
     def run(
         self,
+        *bare: float,
         until: float | None = None,
-        *,
         steps: int | None = None,
         stop: Callable[[Simulation], bool] | None = None,
         every: int = 1,
@@ -201,6 +232,9 @@ class Simulation:
     ) -> None:
         """Make steps until the time ``until`` [s], or so many ``steps``, or until ``stop(self)`` is true after one,
         whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`."""
+        if bare:
+            says = ", ".join(map(repr, bare))
+            raise OptionError(f"run({says}): steps or seconds? allowed is run(steps={says}), or run(until={says}) [s]")
         if until is steps is stop is None:
             raise OptionError("run: without an end; allowed are until, steps and stop")
         refuse_bad(Run(steps=steps or 0))
@@ -489,6 +523,11 @@ class Simulation:
         what = Table(**table, grains=grains, forms=described_forms(world))
         frame = Frame(self.steps, self.time, position, turn, velocity, contacts, what)
         return Snapshot(frame, materials=world.materials, large=described_bodies(world))
+
+
+def _revived(*given: Any) -> Simulation:
+    experiment, settings, kept = given
+    return Simulation(experiment, settings, comm=MPI.COMM_SELF, restart=kept)
 
 
 class Body:

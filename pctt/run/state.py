@@ -153,6 +153,35 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
     write_rows(path, world.comm, rows, shared, {"/": {"format": FORMAT, **made_with}})
 
 
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """The state of a run on this rank, in the place of a checkpoint: arrays that no step changes."""
+
+    local: dict[str, np.ndarray]  #: rows of grains
+    replicated: dict[str, np.ndarray]
+    changed: str  #: of `dem.model.changes.changes`
+    impulses: tuple[np.ndarray, ...]  #: keys and impulses of the last step's contacts
+
+
+def kept(world: World, memory: ImpulseMemory) -> Kept:
+    """The state of a world now."""
+    local, replicated = ({name: array.copy() for name, array in arrays.items()} for arrays in world.state())
+    return Kept(local, replicated, changes(world), tuple(array.copy() for array in memory.state()))
+
+
+def restored(kept: Kept, scene: Scene, comm: MPI.Comm) -> tuple[World, ImpulseMemory]:
+    """The world and the impulses of a state of the scene on as many ranks; collective. ValueError and others for what
+    is none."""
+    world = restored_world(scene, comm, kept.local, kept.replicated)
+    restore(world, kept.changed)
+    memory, (key, impulse) = ImpulseMemory(comm, world.pairs.parts), kept.impulses
+    right = np.isfinite(impulse).all() and impulse.shape == (len(key), 4 * world.pairs.parts)
+    right = right and len(np.unique(key)) == len(key)
+    refuse(comm, "" if right else "impulses of contacts that are no numbers, or two of one contact")
+    memory.restore(key, impulse)
+    return world, memory
+
+
 def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) -> tuple[World, ImpulseMemory]:
     """The world and the impulses of a checkpoint of the scene; collective.
 
@@ -177,17 +206,12 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
 
     old, scene_of, replicated, changed, local, impulses = read(path, comm, take)
     _refuse_other_origin(path, old, scene_of, made_with, comm)
+    times = 1.0 if old["dt"] == made_with["dt"] else made_with["dt"] / old["dt"]
     try:
-        world = restored_world(scene, comm, local, replicated)
-        restore(world, changed)
-        memory, (key, impulse) = ImpulseMemory(comm, world.pairs.parts), impulses
-        right = np.isfinite(impulse).all() and impulse.shape == (len(key), 4 * world.pairs.parts)
-        right = right and len(np.unique(key)) == len(key)
-        refuse(comm, "" if right else "impulses of contacts that are no numbers, or two of one contact")
+        key, impulse = impulses
+        return restored(Kept(local, replicated, changed, (key, times * impulse)), scene, comm)
     except (AttributeError, KeyError, TypeError, ValueError) as error:  # of another scene file
         raise OptionError(f"-restart {path}: {error}") from None
-    memory.restore(key, impulse if old["dt"] == made_with["dt"] else impulse * (made_with["dt"] / old["dt"]))
-    return world, memory
 
 
 def _refuse_other_format(file: h5py.File) -> None:
