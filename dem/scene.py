@@ -13,7 +13,7 @@ by a `dem.arrays.Rule` takes no memory at all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Union
@@ -324,8 +324,10 @@ class Scene:
         """
         if not name or name in (body.name for body in self.large_bodies):
             raise ValueError(f"large bodies need distinct names, got {name!r}")
-        if not shapes:
-            raise ValueError(f"large body {name!r} has no shape")
+        if not isinstance(shapes, Iterable) or not (shapes := tuple(shapes)):
+            raise ValueError(f"shapes of {name!r}: {shapes!r}; allowed is a list of one or more")
+        if isinstance(motion, type):
+            raise ValueError(f"motion of {name!r}: the class {motion.__name__}; allowed is one, {motion.__name__}(...)")
         place = checks.vector(f"position of {name!r}", position)
         turn = checks.unit_quaternion(f"quaternion of {name!r}", quaternion)
         speed = np.hstack([checks.vector(f"{kind}velocity", given)
@@ -526,6 +528,20 @@ class Scene:
     def materials(self) -> tuple[str, ...]:
         """The names of the materials, in the order of their numbers."""
         return tuple(self._materials)
+
+    def doubts(self) -> str:
+        """What is likely a mistake, in words: materials that nothing has, and moments of more than a radius; empty if
+        there is nothing."""
+        used = {int(number) for part in self.parts for number in np.unique(part.material)}
+        used |= {body.material for body in self.large_bodies} | {source.material for source in self.sources.values()}
+        here = {name for name, number in self._materials.items() if number in used}
+        unused = [name for name in self.materials if name not in here]
+        found = [f"no body has the material {name!r}{checks.nearest(name, here)}" for name in unused]
+        most = max(max(law.rolling, law.spinning) for law in (self._law, *self._pairs.values()))
+        if self.count and most > (size := float(bodies.bounding_radius(self.survey().extremes).max())):
+            words = f"rolling or spinning of {most:g} m, a length, is more than the greatest radius, {size:g} m"
+            found.append(f"{words}: a coefficient times the radius?")
+        return "; ".join(found)
 
     def pairs(self, stiffness: float) -> ContactLaw:
         """The tables of all pairs of materials, with this `stiffness` [N/m] where none is stated."""

@@ -47,7 +47,7 @@ from dem.together import meet, together
 from pctt import ccp, log
 from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
-from pctt.options import OptionError, made, refuse_bad
+from pctt.options import OptionError, made, nearest, refuse_bad
 from pctt.petsc import warn
 from pctt.render import Picture, picture
 from pctt.run import report, state
@@ -124,6 +124,8 @@ class Simulation:
         falls = "" if restart else comm.bcast(fall_remark(scene, self.settings.dt))
         if large := step_remark(self.world, self.settings.dt) or falls:
             warn(comm, large)
+        if doubts := "" if restart else comm.bcast(scene.doubts()):
+            warn(comm, doubts)
         self._turns = TurnWatch()
         self._tell_turns()
         self._begun = restart
@@ -137,6 +139,15 @@ class Simulation:
         self.figures: dict[str, Any] = {}
         self.output: Writer | None = None
         self._closed = False
+        self._known = {"_known", "_row", *vars(self)}
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """AttributeError for a name that a simulation does not have: it would do nothing."""
+        known = vars(self).get("_known")
+        if known and name not in known and not hasattr(type(self), name):
+            helps = "settings are arguments of Simulation, and change(...) changes bodies, loads, the cell"
+            raise AttributeError(f"a Simulation has no {name!r} to set; {helps}{nearest(name, known)}")
+        super().__setattr__(name, value)
 
     @classmethod
     def load(cls, path: str | Path, scene: Scene | Experiment, *given: Any, **more: Any) -> Simulation:
@@ -238,6 +249,8 @@ class Simulation:
         if until is steps is stop is None:
             raise OptionError("run: without an end; allowed are until, steps and stop")
         refuse_bad(Run(steps=steps or 0))
+        if until is not None and float(until) < self.time - 0.5 * self.settings.dt:
+            raise OptionError(f"run(until={until}): the time is {self.time:g} s already; allowed is a later one")
         left = math.inf if steps is None else steps
         if until is not None:
             left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
