@@ -51,6 +51,27 @@ class Rule:
             yield first, self[first : first + self.CHUNK]
 
 
+class Tabular:
+    """A table whose fields are arrays (n,) or (n, parts): ``dict(table)`` has a column (n,) for each part, and so has
+    ``pandas.DataFrame(dict(table))``."""
+
+    def keys(self) -> list[str]:
+        """The names of the columns."""
+        return list(self.flat())
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.flat()[name]
+
+    def flat(self) -> dict[str, np.ndarray]:
+        """The columns (n,) by name; parts of vectors have x, y, z behind the name, others a number."""
+        found = {}
+        for name, array in vars(self).items():
+            for k, column in enumerate(array.T if array.ndim == 2 else [array]):
+                end = "" if array.ndim == 1 else f"_{'xyz'[k]}" if array.shape[1] == 3 else f"_{k}"
+                found[name + end] = column
+        return found
+
+
 #: Anything that a user may pass where numbers are expected.
 ArrayLike = Union[float, Sequence[float], Sequence[Sequence[float]], Floats, Rule]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from dem import quaternion
-from dem.arrays import Bools, Floats, Ints
+from dem.arrays import Bools, Floats, Ints, Tabular
 from dem.compiled import loop
 
 #: Kinds of bodies (the column `shape`); a COMPOUND is a large body, its primitives are kept elsewhere. Half spaces and
@@ -26,7 +26,7 @@ CLUMP, POLYHEDRON, CONVEX = FORM, 1 << 20, 1 << 21
 
 
 @dataclass
-class Bodies:
+class Bodies(Tabular):
     """Rigid bodies as a struct of arrays; all vectors in the world frame, SI units.
 
     Bodies whose motion is prescribed have infinite mass and moments, so that every inverse is exactly zero.

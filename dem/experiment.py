@@ -86,7 +86,10 @@ class Given(Experiment):
     """A scene that is built already."""
 
     def __init__(self, scene: Scene):
-        self.build = lambda: scene  # type: ignore[method-assign]
+        self.scene = scene
+
+    def build(self) -> Scene:
+        return self.scene
 
 
 class SceneFileError(ValueError):

@@ -6,15 +6,18 @@ outwards bounds a solid, which has volume, centre and inertia.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from dem import stl
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.checks import between, check_fields, finite, not_negative, positive, rows, unit_quaternion, vector
 from dem.compiled import loop
@@ -260,22 +263,29 @@ class Mesh:
         center: Sequence[float] = (0.0, 0.0, 0.0),
         quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
     ) -> Mesh:
-        """From an STL or OBJ file, or another that trimesh reads; `scale` is the unit of its numbers in metres (1e-3:
-        millimetres). Corners in the same place become one vertex.
+        """From an STL file, or an OBJ or another one that trimesh reads; `scale` is the unit of its numbers in metres
+        (1e-3: millimetres). Corners in the same place become one vertex.
 
-        ValueError, which names the file, if it cannot be read, has no triangle or if trimesh is not there.
+        ValueError, which names the file, if it cannot be read, has no triangle or needs trimesh, which is not there.
         """
         positive(f"scale of {file}", scale)
-        trimesh = _trimesh(f"{file}: meshes are read")
         if not Path(file).is_file():
             raise ValueError(f"{file}: no such file")
         try:
-            loaded = trimesh.load(str(file), force="mesh", process=False)
-            if len(loaded.faces):  # the numbers of STL files have seven digits
-                loaded.merge_vertices(digits_vertex=6 - int(np.ceil(np.log10(loaded.extents.max()))))
-            vertices, triangles = np.array(loaded.vertices, dtype=float), np.array(loaded.faces, dtype=np.int64)
+            if Path(file).suffix.lower() == ".stl":
+                corners = stl.corners(Path(file).read_bytes())
+                vertices, triangles = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+            else:
+                load = _trimesh(f"{file}: such meshes are read").load
+                bare = _without_looks(Path(file).read_bytes()) if Path(file).suffix.lower() == ".obj" else str(file)
+                loaded = load(bare, file_type=Path(file).suffix[1:].lower(), force="mesh", process=False)
+                vertices, triangles = np.array(loaded.vertices, dtype=float), np.array(loaded.faces, dtype=np.int64)
+            vertices, triangles = _merged(vertices, triangles)
+        except NoTrimeshError:
+            raise
         except Exception as error:  # whatever a damaged file makes of the reader
-            raise ValueError(f"{file}: cannot be read as a mesh ({type(error).__name__}: {error})") from None
+            why = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            raise ValueError(f"{file}: cannot be read as a mesh ({why})") from None
         if not len(triangles):
             raise ValueError(f"{file}: has no triangle")
         try:
@@ -320,10 +330,30 @@ class Mesh:
         trimesh.Trimesh(self.vertices, self.triangles, process=False).export(str(file))
 
 
+def _without_looks(data: bytes) -> BytesIO:
+    """An OBJ file with nothing but its corners and faces: texture, normals and materials need other packages."""
+    lines = [line.strip() for line in data.replace(b"\\\n", b" ").splitlines()]
+    return BytesIO(b"\n".join(re.sub(rb"/\S*", b"", line) for line in lines if line[:2] in (b"v ", b"f ")))
+
+
+def _merged(vertices: Floats, triangles: Ints) -> tuple[Floats, Ints]:
+    """The same triangles, with one vertex for all corners in a place, whatever texture they have: files have six or
+    seven digits."""
+    if not len(triangles):
+        return vertices, triangles
+    digits = 6 - int(np.ceil(np.log10(max(float(np.ptp(finite("corners", vertices), axis=0).max()), 1e-300))))
+    _, first, row = np.unique(np.round(vertices * 10.0**digits), axis=0, return_index=True, return_inverse=True)
+    return vertices[first], row.reshape(-1)[triangles]
+
+
+class NoTrimeshError(ValueError):
+    """The optional package trimesh is not there."""
+
+
 def _trimesh(what: str) -> Any:
-    """The optional package; ValueError if it is not there."""
+    """The optional package; NoTrimeshError if it is not there."""
     try:
         import trimesh
     except ImportError:
-        raise ValueError(f"{what} by trimesh, which is not there: pip install 'pctt[meshes]', or trimesh") from None
+        raise NoTrimeshError(f"{what} by trimesh, which is not there: pip install 'pctt[meshes]', or trimesh") from None
     return trimesh

@@ -13,8 +13,9 @@ by a `dem.arrays.Rule` takes no memory at all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar, Union
 
 import numpy as np
@@ -123,7 +124,7 @@ class Part:
 
     count: int
     kind: int
-    material: int
+    material: int | Ints  #: of all, or (count,)
     given: dict[str, Column]
     #: from the columns of `given`: position, quaternion, size, mass and inertia, as of `Bodies`
     solid: Callable[[dict[str, Floats]], tuple[Floats, ...]]
@@ -139,7 +140,7 @@ class Part:
             velocity=np.hstack([given["velocity"], given["angular velocity"]]),
             mass=mass,
             inertia=inertia,
-            material=np.full(many, self.material),
+            material=np.full(many, self.material if isinstance(self.material, int) else self.material[first:end]),
             shape=np.full(many, self.kind),
             size=size,
             weight=np.zeros(many),
@@ -186,20 +187,27 @@ class Scene:
         self.named = no_parts()  #: loads, springs, joints and sources by kind and name, see `KINDS`
         self.passages = Passages(self.named["source"])  #: sources and outlets
 
+    def __repr__(self) -> str:
+        parts = [f"{self.count} grains", f"{len(self.large_bodies)} large bodies"]
+        parts[1] += "".join(f", {body.name!r}" for body in self.large_bodies[:5])
+        parts += [f"{len(members)} {kind}s" for kind, members in self.named.items() if members]
+        return f"<Scene: {'; '.join(parts)}; friction {self._law.friction:g}>"
+
     def add_spheres(
         self,
         positions: ArrayLike,
         radius: ArrayLike,
         density: ArrayLike,
         *,
-        material: str = "default",
+        material: str | Sequence[str] = "default",
         velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
     ) -> Ints | range:
         """Add solid spheres and return their ids (n,).
 
-        positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3). What has a
-        row for each sphere may be a `dem.arrays.Rule`, of which every rank makes its part alone; so of other grains.
+        positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3); the name
+        of a material, or (n,) names. What has a row for each sphere may be a `dem.arrays.Rule`, of which every rank
+        makes its part alone; so of other grains. `pctt.beds.read_spheres` has these arguments from a file.
         """
         upright, lengths = (1.0, 0.0, 0.0, 0.0), {"radius": radius}
         return self._add_grains(SPHERE, positions, lengths, density, material, upright, velocity, angular_velocity)
@@ -334,8 +342,10 @@ class Scene:
         """
         if not name or name in (body.name for body in self.large_bodies):
             raise ValueError(f"large bodies need distinct names, got {name!r}")
-        if not shapes:
-            raise ValueError(f"large body {name!r} has no shape")
+        if not isinstance(shapes, Iterable) or not (shapes := tuple(shapes)):
+            raise ValueError(f"shapes of {name!r}: {shapes!r}; allowed is a list of one or more")
+        if isinstance(motion, type):
+            raise ValueError(f"motion of {name!r}: the class {motion.__name__}; allowed is one, {motion.__name__}(...)")
         place = checks.vector(f"position of {name!r}", position)
         turn = checks.unit_quaternion(f"quaternion of {name!r}", quaternion)
         speed = np.hstack([checks.vector(f"{kind}velocity", given)
@@ -515,6 +525,20 @@ class Scene:
         """The names of the materials, in the order of their numbers."""
         return tuple(self._materials)
 
+    def doubts(self) -> str:
+        """What is likely a mistake, in words: materials that nothing has, and moments of more than a radius; empty if
+        there is nothing."""
+        used = {int(number) for part in self.parts for number in np.unique(part.material)}
+        used |= {each.material for each in (*self.large_bodies, *self.passages.sources.values())}
+        here = {name for name, number in self._materials.items() if number in used}
+        unused = [name for name in self.materials if name not in here]
+        found = [f"no body has the material {name!r}{checks.nearest(name, here)}" for name in unused]
+        most = max(max(law.rolling, law.spinning) for law in (self._law, *self._pairs.values()))
+        if self.count and most > (size := float(bodies.bounding_radius(self.survey().extremes).max())):
+            words = f"rolling or spinning of {most:g} m, a length, is more than the greatest radius, {size:g} m"
+            found.append(f"{words}: a coefficient times the radius?")
+        return "; ".join(found)
+
     def pairs(self, stiffness: float) -> ContactLaw:
         """The tables of all pairs of materials, with this `stiffness` [N/m] where none is stated."""
         return contact_law.tables(len(self._materials), self._law, self._pairs, stiffness)
@@ -570,17 +594,11 @@ class Scene:
         return self._materials.setdefault(name, len(self._materials))
 
     def _add_grains(
-        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike, material: str,
-        quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
+        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike,
+        material: str | Sequence[str], quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
     ) -> Ints | range:  # fmt: skip
         """Add grains of one kind, of which `lengths` has the columns of `size` by name; their ids."""
-
-        def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
-            size = np.zeros((len(given["density"]), 3))
-            for k, name in enumerate(lengths):
-                size[:, slice(None) if kind == BOX else k] = given[name]
-            return given["positions"], _unit(given["quaternions"]), size, *shapes.solid(kind, size, given["density"])
-
+        solid = partial(_plain, kind, tuple(lengths))
         return self._append(
             kind, positions, lengths, density, material, quaternions, velocity, angular_velocity, solid
         )
@@ -592,14 +610,7 @@ class Scene:
         """Add grains of one form, whose positions and quaternions are those of the frame in which it was given; their
         ids."""
         self._know(form)
-
-        def solid(given: dict[str, Floats]) -> tuple[Floats, ...]:
-            turns, rho, times = _unit(given["quaternions"]), given["density"][:, None], given["scale"][:, None]
-            centers = given["positions"] + quaternion.rotate(turns, times * form.place)
-            turns = quaternion.multiply(turns, np.tile(form.turn, (len(rho), 1)))
-            mass, inertia = (rho * times**3 * form.volume)[:, 0], rho * times**5 * form.moments
-            return centers, turns, times * form.size, mass, inertia
-
+        solid = partial(_formed, form)
         kind = form.BASE + self.forms.index(form)
         return self._append(
             kind, positions, {"scale": scale}, density, material, quaternions, velocity, angular_velocity, solid
@@ -610,8 +621,8 @@ class Scene:
             self.forms.append(form)
 
     def _append(
-        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike, material: str,
-        quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
+        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike,
+        material: str | Sequence[str], quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
         solid: Callable[[dict[str, Floats]], tuple[Floats, ...]],
     ) -> Ints | range:  # fmt: skip
         """Add grains of one kind; their ids, a range where the positions are a `Rule`."""
@@ -628,10 +639,31 @@ class Scene:
             Column.of("angular velocity", angular_velocity, count, 3),
         ]
         given = {column.name: column for column in columns}
-        self.parts.append(Part(count, kind, self._material(material), given, solid))
+        if not isinstance(material, str) and len(material) != count:
+            raise ValueError(f"material must be one name or {count} names, got {len(material)}")
+        one = isinstance(material, str)
+        numbers = self._material(str(material)) if one else np.array([self._material(name) for name in material])
+        self.parts.append(Part(count, kind, numbers, given, solid))
         self._survey = None
         ids = range(first, first + count)
         return ids if isinstance(positions, Rule) else np.array(ids, np.int64)
+
+
+def _plain(kind: int, lengths: tuple[str, ...], given: dict[str, Floats]) -> tuple[Floats, ...]:
+    """`Part.solid` of spheres, boxes and capsules, of which `lengths` are the columns of `size` by name."""
+    size = np.zeros((len(given["density"]), 3))
+    for k, name in enumerate(lengths):
+        size[:, slice(None) if kind == BOX else k] = given[name]
+    return given["positions"], _unit(given["quaternions"]), size, *shapes.solid(kind, size, given["density"])
+
+
+def _formed(form: Form, given: dict[str, Floats]) -> tuple[Floats, ...]:
+    """`Part.solid` of grains of a form."""
+    turns, rho, times = _unit(given["quaternions"]), given["density"][:, None], given["scale"][:, None]
+    centers = given["positions"] + quaternion.rotate(turns, times * form.place)
+    turns = quaternion.multiply(turns, np.tile(form.turn, (len(rho), 1)))
+    mass, inertia = (rho * times**3 * form.volume)[:, 0], rho * times**5 * form.moments
+    return centers, turns, times * form.size, mass, inertia
 
 
 def _unit(quaternions: Floats) -> Floats:

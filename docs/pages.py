@@ -33,7 +33,8 @@ PARTS = {
     "Simulations and their results": ["pctt", "pctt.simulation", "pctt.folder", "pctt.analysis", "dem.measures"],
     "What a scene is made of": [
         "dem.scene", "dem.shapes", "dem.mesh", "dem.motion", "dem.parts.contact_law", "dem.parts.loads",
-        "dem.parts.springs", "dem.parts.joints", "dem.parts.sources", "dem.parts.cell", "dem.packing", "dem.experiment",
+        "dem.parts.springs", "dem.parts.joints", "dem.parts.sources", "dem.parts.cell", "dem.packing", "pctt.beds",
+        "dem.experiment",
         "pctt.scenes", "dem.start.stiffness", "dem.start.time_step", "dem.checks", "dem.record.analysis",
     ],
     "What a time step is made of": [
@@ -48,6 +49,7 @@ PARTS = {
 #: What is public of modules that define helpers of other modules too.
 ONLY = {
     "pctt.simulation": ["Body"],
+    "pctt.beds": ["read_spheres"],
     "dem.scene": ["LargeBody", "Scene"],
     "dem.unconstrained": ["UnconstrainedMotion", "unconstrained"],
     "dem.shapes": [
@@ -74,9 +76,9 @@ def public(name: str) -> dict[str, Any]:
 
 
 def homes() -> dict[str, Any]:
-    """All public classes and functions by their full names, of each the first."""
+    """All public classes and functions by their full names, of each the first; `pctt` has names of all others, too."""
     found: dict[str, Any] = {}
-    for module in (name for names in PARTS.values() for name in names):
+    for module in sorted((name for names in PARTS.values() for name in names), key=lambda name: name == "pctt"):
         for key, value in public(module).items():
             if (inspect.isclass(value) or inspect.isfunction(value)) and value not in found.values():
                 found[f"{module}.{key}"] = value
@@ -143,7 +145,7 @@ def reference() -> Iterator[tuple[str, str]]:
                     yield home, class_page(home, code, *done.get(code, ("", 0.0)))
             elif inspect.isfunction(inspect.unwrap(value)):  # also of one that is compiled
                 functions.append(f".. autofunction:: {module}.{key}")
-            else:
+            elif not inspect.ismodule(value):
                 values = [value] if isinstance(value, str) else value
                 constants.append(f"| `{key}` | {', '.join(f'`{one}`' for one in values)} |")
         text = [f"# `{module}`", "```{eval-rst}", f".. automodule:: {module}", "   :no-members:", "```", ""]

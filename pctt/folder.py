@@ -31,6 +31,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem import bodies
+from dem.arrays import Tabular
 from pctt import disk
 from pctt.disk import FileError, same_rows, write_text
 
@@ -119,7 +120,7 @@ def totals(steps: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 # -- reading -------------------------------------------------------------------------------------------------
 
 @dataclass(frozen=True)
-class Contacts:
+class Contacts(Tabular):
     """The contacts of a step between bodies a and b, and the impulses that acted in the step."""
 
     bodies: np.ndarray  #: (nc, 2) numbers of a and b in the order of the scene: grains, then large bodies
@@ -139,6 +140,12 @@ class Contacts:
 
     def __len__(self) -> int:
         return len(self.gap)
+
+    def flat(self) -> dict[str, np.ndarray]:
+        """Columns (nc,) by name: bodies a and b, and of point [m], normal and force [N] x, y, z; gap [m]."""
+        found = {"a": self.bodies[:, 0], "b": self.bodies[:, 1], "gap": self.gap}
+        vectors = {"point": self.point, "normal": self.normal, "force": self.force}
+        return found | {f"{name}_{'xyz'[k]}": array[:, k] for name, array in vectors.items() for k in range(3)}
 
     @property
     def normal(self) -> np.ndarray:

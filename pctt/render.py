@@ -86,6 +86,9 @@ class Picture:
     def __init__(self, pixels: np.ndarray):
         self.pixels = pixels
 
+    def __repr__(self) -> str:
+        return f"<Picture of {self.pixels.shape[1]} x {self.pixels.shape[0]} pixels, which save(file) writes as PNG>"
+
     def _repr_png_(self) -> bytes:
         """The picture as a file in PNG format."""
         from PIL import Image

@@ -46,7 +46,7 @@ from dem.together import meet, together
 from pctt import ccp, log
 from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
-from pctt.options import OptionError, made, refuse_bad
+from pctt.options import OptionError, made, nearest, refuse_bad
 from pctt.petsc import warn
 from pctt.render import Picture, picture
 from pctt.run import report, state
@@ -82,7 +82,7 @@ class Simulation:
         settings: Settings | None = None,
         *,
         comm: MPI.Comm = MPI.COMM_WORLD,
-        restart: str | Path = "",
+        restart: str | Path | state.Kept = "",
         compare: ccp.Comparison | None = None,
         say: Callable[[str], object] = print,
         program: bool = False,
@@ -113,17 +113,22 @@ class Simulation:
         if restart == "settled":
             restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
         self._origin = state.origin(self.experiment, scene, self.settings.dt)
-        if restart:
+        if isinstance(restart, state.Kept):
+            self.world, self.memory = state.restored(restart, scene, comm)
+        elif restart:
             self.world, self.memory = state.load(Path(restart), scene, self._origin, comm)
         else:
-            self.world = state.world_at_start(self.experiment, scene, comm)
+            self.world = state.world_at_start(self.experiment, self.settings, scene, comm)
             self.memory = ImpulseMemory(comm, self.world.pairs.parts, self.world.pairs.columns)
         falls = "" if restart else comm.bcast(fall_remark(scene, self.settings.dt))
         if large := step_remark(self.world, self.settings.dt) or falls:
             warn(comm, large)
+        if doubts := "" if restart else comm.bcast(scene.doubts()):
+            warn(comm, doubts)
         self._turns = TurnWatch()
         self._tell_turns()
-        self.restart = str(restart)  #: the file from which it goes on
+        self._begun = restart
+        self.restart = "" if isinstance(restart, state.Kept) else str(restart)  #: the file from which it goes on
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
         watch = OverlapWatch(scene, self.settings, float(self.world.pairs.stiffness.min()))
@@ -133,12 +138,46 @@ class Simulation:
         self.figures: dict[str, Any] = {}
         self.output: Writer | None = None
         self._closed = False
+        self._known = {"_known", "_row", *vars(self)}
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """AttributeError for a name that a simulation does not have: it would do nothing."""
+        known = vars(self).get("_known")
+        if known and name not in known and not hasattr(type(self), name):
+            helps = "settings are arguments of Simulation, and change(...) changes bodies, loads, the cell"
+            raise AttributeError(f"a Simulation has no {name!r} to set; {helps}{nearest(name, known)}")
+        super().__setattr__(name, value)
 
     @classmethod
     def load(cls, path: str | Path, scene: Scene | Experiment, *given: Any, **more: Any) -> Simulation:
         """The simulation that `save` kept, or a checkpoint.h5 of a run, with the same scene and time step; the other
         arguments are those of a new one. On as many ranks it goes on with the same bits."""
         return cls(scene, *given, restart=path, **more)
+
+    def copy(self) -> Simulation:
+        """Another simulation in the same state, which goes on with the same bits, and writes no files; collective."""
+        kept = state.kept(self.world, self.memory)
+        other = Simulation(self.experiment, self.settings, comm=self.comm, restart=kept, compare=self._compare)
+        other.last, other.figures = self.last, dict(self.figures)
+        return other
+
+    def reset(self) -> None:
+        """Go back to where the simulation began: time zero, or its checkpoint; collective. OptionError while `write`
+        writes files."""
+        if self.output is not None:
+            raise OptionError(f"reset: this simulation writes to {self.output.place.folder}; allowed is a new one")
+        fresh = Simulation(
+            self.experiment, self.settings, comm=self.comm, restart=self._begun, compare=self._compare,
+            program=self._program,
+        )  # fmt: skip
+        self.stepper.destroy()
+        vars(self).update(vars(fresh))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For pickle: what `copy` takes, of a simulation of one rank; it wakes up on one rank, too."""
+        if self.comm.size > 1:
+            raise TypeError(f"pickle of a simulation on {self.comm.size} ranks: allowed are one rank, or save and load")
+        return _revived, (self.experiment, self.settings, state.kept(self.world, self.memory))
 
     def __enter__(self) -> Simulation:
         return self
@@ -160,6 +199,9 @@ class Simulation:
         except NoSolutionError:
             if output:
                 output.keep()
+            raise
+        except KeyboardInterrupt:
+            self.world.lists = None  # those of the search may be half made
             raise
         with log.phase("output"):
             row = recording.row(made.step, self.experiment)
@@ -191,8 +233,8 @@ class Simulation:
 
     def run(
         self,
+        *bare: float,
         until: float | None = None,
-        *,
         steps: int | None = None,
         stop: Callable[[Simulation], bool] | None = None,
         every: int = 1,
@@ -200,9 +242,14 @@ class Simulation:
     ) -> None:
         """Make steps until the time ``until`` [s], or so many ``steps``, or until ``stop(self)`` is true after one,
         whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`."""
+        if bare:
+            says = ", ".join(map(repr, bare))
+            raise OptionError(f"run({says}): steps or seconds? allowed is run(steps={says}), or run(until={says}) [s]")
         if until is steps is stop is None:
             raise OptionError("run: without an end; allowed are until, steps and stop")
         refuse_bad(Run(steps=steps or 0))
+        if until is not None and float(until) < self.time - 0.5 * self.settings.dt:
+            raise OptionError(f"run(until={until}): the time is {self.time:g} s already; allowed is a later one")
         left = math.inf if steps is None else steps
         if until is not None:
             left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
@@ -482,6 +529,11 @@ class Simulation:
         return Snapshot(frame, materials=world.materials, large=described_bodies(world))
 
 
+def _revived(*given: Any) -> Simulation:
+    experiment, settings, kept = given
+    return Simulation(experiment, settings, comm=MPI.COMM_SELF, restart=kept)
+
+
 class Body:
     """A large body of a simulation, as it is now. Vectors are in the world frame; what is not said to be collective is
     not."""
@@ -490,6 +542,11 @@ class Body:
 
     def __init__(self, sim: Simulation, row: int):
         self._sim, self._row = sim, row
+
+    def __repr__(self) -> str:
+        place = ", ".join(f"{x:.4g}" for x in self.position)
+        speed = float(np.linalg.norm(self.velocity[:3]))
+        return f"<Body {self.name!r}: {type(self.motion).__name__}, at ({place}) m, {speed:.4g} m/s>"
 
     @property
     def name(self) -> str:

@@ -91,7 +91,8 @@ class Load(Force, Timed):
             single = max(single, float(each.max()), float(np.linalg.norm(np.atleast_2d(torque), axis=1).max()) / half)
             count = scene.count if load.on is None else len(load.on)
             if isinstance(load.on, str):
-                count = sum(part.count for part in scene.parts if scene.materials[part.material] == load.on)
+                number = scene.materials.index(load.on) if load.on in scene.materials else -1
+                count = sum(int(np.full(part.count, part.material == number).sum()) for part in scene.parts)
             spread.append(np.array(count * force if force.ndim == 1 else force.sum(axis=0)))
             accelerations.append(scene.gravity + np.atleast_2d(force)[each.argmax()] / mass)
         return Pressing(single, tuple(spread), tuple(accelerations), tuple(pushes))

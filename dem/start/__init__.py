@@ -32,7 +32,7 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     """The scene at time zero, distributed; collective.
 
     Bodies of prescribed motion are where their motions put them at time zero. ValueError if nothing moves, or if
-    bodies overlap by more than `overlap` half thicknesses (`_refuse_overlap`); SceneError if a motion fails.
+    bodies overlap by more than `overlap` half thicknesses (`refuse_overlap`); SceneError if a motion fails.
     """
     scene.survey(comm)
     rows = even_slice(scene.count, comm)
@@ -40,7 +40,7 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     world.put_large(world.poses(0.0))
     put_back(world)
     redistribute(world)
-    _refuse_overlap(world, overlap)
+    refuse_overlap(world, overlap)
     return world
 
 
@@ -151,7 +151,7 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     return world
 
 
-def _refuse_overlap(world: World, overlap: float) -> None:
+def refuse_overlap(world: World, overlap: float) -> None:
     """ValueError, on all ranks, that names the worst pair if bodies overlap by more than `overlap` half thicknesses of
     the thinner one that forces move.
 
@@ -170,7 +170,9 @@ def _refuse_overlap(world: World, overlap: float) -> None:
         worst = (float(relative[c]), float(-contacts.gap[c]), int(pair[c, 0]), int(pair[c, 1]))
     relative_depth, depth, a, b = world.comm.allreduce(worst, MPI.MAX)
     if relative_depth > overlap:
-        raise ValueError(f"overlapping start: {world.name_of(a)} and {world.name_of(b)} overlap by {depth:g} m")
+        pair = f"{world.name_of(a)} and {world.name_of(b)} overlap by {depth:g} m"
+        most = f"{relative_depth:.2g} half thicknesses, where {overlap:g} are allowed"
+        raise ValueError(f"overlapping start: {pair}, {most}")
 
 
 def step_remark(world: World, dt: float) -> str:

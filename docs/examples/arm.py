@@ -10,9 +10,7 @@ import sys
 import numpy as np
 
 import pctt
-from dem.motion import Dynamic
-from dem.scene import Scene
-from dem.shapes import Box, Plane
+from pctt import Box, Dynamic, Plane, Scene
 
 
 def arm(n: int = 4) -> Scene:

@@ -10,10 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dem.experiment import Experiment, option
-from dem.motion import Guided
-from dem.scene import Scene
-from dem.shapes import Box, Plane
+from pctt import Box, Experiment, Guided, Plane, Scene, option
 
 PHI = 0.5 * (1 + 5**0.5)
 CUBE = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])

@@ -11,11 +11,7 @@ from math import cos, radians, sin
 
 import numpy as np
 
-from dem.experiment import Experiment, option
-from dem.motion import Glide
-from dem.packing import perturbed
-from dem.scene import Scene
-from dem.shapes import Box, Plane
+from pctt import Box, Experiment, Glide, Plane, Scene, option, perturbed
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,7 @@ from math import pi, sqrt
 
 import numpy as np
 
-from dem.experiment import Experiment, option
-from dem.mesh import Mesh
-from dem.motion import Rotation
-from dem.packing import perturbed
-from dem.scene import Scene
-from dem.shapes import Plane
+from pctt import Experiment, Mesh, Plane, Rotation, Scene, option, perturbed
 
 RADIUS = 0.004  # of a sphere [m]
 ARM = 0.072  # from the axis to the middle of the bucket's bottom [m]

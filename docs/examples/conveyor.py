@@ -10,9 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dem.experiment import Experiment, option
-from dem.scene import Scene
-from dem.shapes import Box
+from pctt import Box, Experiment, Scene, option
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,7 @@ from math import pi, sqrt
 
 import numpy as np
 
-from dem.experiment import Experiment, option
-from dem.mesh import Mesh
-from dem.motion import Rotation
-from dem.packing import perturbed
-from dem.scene import Scene
+from pctt import Experiment, Mesh, Rotation, Scene, option, perturbed
 
 
 @dataclass(frozen=True)

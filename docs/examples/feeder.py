@@ -12,11 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dem.arrays import Floats
-from dem.experiment import Experiment, option
-from dem.measures import Block
-from dem.parts.sources import Uniform
-from dem.scene import Scene
-from dem.shapes import Box
+from pctt import Block, Box, Experiment, Scene, Uniform, option
 
 
 @dataclass(frozen=True)

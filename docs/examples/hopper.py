@@ -11,12 +11,7 @@ from math import pi, radians, tan
 
 import numpy as np
 
-from dem.experiment import Experiment, option
-from dem.mesh import Mesh
-from dem.motion import Glide
-from dem.packing import perturbed
-from dem.scene import Scene
-from dem.shapes import Plane
+from pctt import Experiment, Glide, Mesh, Plane, Scene, option, perturbed
 
 
 @dataclass(frozen=True)

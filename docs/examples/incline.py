@@ -12,9 +12,7 @@ from math import cos, radians, sin
 
 import numpy as np
 
-from dem.experiment import Experiment, option
-from dem.scene import Scene
-from dem.shapes import Plane
+from pctt import Experiment, Plane, Scene, option
 
 GRAVITY = 9.81  # [m/s^2]
 

@@ -14,8 +14,7 @@ from math import cos, radians, sin
 from mpi4py import MPI
 
 import pctt
-from dem.scene import Scene
-from dem.shapes import Plane
+from pctt import Plane, Scene
 
 G, SLOPE = 9.81, radians(25.0)
 FRICTIONS, LAWS = (0.0, 0.2, 0.4, 0.6), ("coulomb", "relaxation")

@@ -10,12 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dem import measures
-from dem.experiment import Experiment, option
-from dem.motion import Oscillation
-from dem.packing import perturbed
-from dem.scene import Scene
-from dem.shapes import Plane
+from pctt import Experiment, Oscillation, Plane, Scene, measures, option, perturbed
 
 
 @dataclass(frozen=True)

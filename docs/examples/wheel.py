@@ -11,12 +11,7 @@ from math import cos, pi, sin
 
 import numpy as np
 
-from dem.experiment import Experiment, option
-from dem.mesh import Mesh
-from dem.motion import Held
-from dem.packing import perturbed
-from dem.scene import Scene
-from dem.shapes import Box, Plane
+from pctt import Box, Experiment, Held, Mesh, Plane, Scene, option, perturbed
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,11 @@ class JointNow:
             raise ValueError(f"no joint {name!r}; there are: {', '.join(there) or 'none'}")
         self._sim, self.name, self._number = sim, name, number_of(sim.world, "joint", name)
 
+    def __repr__(self) -> str:
+        joint = self._sim.world.joints[self.name]
+        one, other = ("the world" if end is None else repr(end) for end in joint.ends)
+        return f"<Joint {self.name!r}: {joint.kind} of {one} and {other}>"
+
     @property
     def _now(self) -> tuple[Joint, Geometry, Floats]:
         """The joint, the geometry of all, and the velocities (6,) of its second end relative to the first."""

@@ -38,7 +38,7 @@ from pctt.run.settings import DEMO, Options, Run, Settings, find_scene
 #: Options of simulations, beside those of the scene; those that settled states depend on, and -quiet.
 OF_STEPS = {
     "scene", "steps", "dt", "delta", "stiffness", "recovery_speed", "restart", "settle", "output_every",
-    "checkpoint_every", "checkpoint_minutes", "dump_problem",
+    "checkpoint_every", "checkpoint_minutes", "dump_problem", "overlap",
 }  # fmt: skip
 OF_SETTLING = {"settle", "scene", "quiet"}
 

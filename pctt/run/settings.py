@@ -32,6 +32,15 @@ from pctt.scenes import SCENES
 
 #: By how much a contact may close in a step beyond what its spring gives, as a part of the contact distance.
 CLOSING = 0.15
+RELAX = "relax"  #: a value of the option -overlap
+
+
+def _is_overlap(text: str) -> bool:
+    try:
+        return text == RELAX or NOT_NEGATIVE[1](float(text))
+    except ValueError:
+        return False
+
 
 # options of PETSc and of preconditioners in the demo
 DEMO_SOLVERS = {
@@ -104,8 +113,18 @@ class Settings(ccp.Limits):
         1.0, "greatest speed at which rigid bodies that overlap are pushed apart", unit="m/s", check=NOT_NEGATIVE,
         name="recovery_speed",
     )  # fmt: skip
+    overlap: str = option(
+        "0.01",
+        "greatest overlap of bodies at the start, over half the thickness of the thinner one; relax: any, and they are "
+        "pushed apart before the first step, without a speed",
+        check=("a number >= 0, or relax", _is_overlap),
+        name="overlap",
+    )
     options: Any = number(None, "options of the solver, an instance of its class or a dict of its fields")
     settle_tol: float = number(1e-3, "tol of settling; its last tenth has a tenth of it and mends the overlaps")
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "overlap", str(self.overlap))  # a number is one, too
 
     @property
     def limits(self) -> ccp.Limits:

@@ -27,7 +27,7 @@ from dem.model.world import World
 from dem.quaternion import cross
 from dem.scene import LargeBody, Scene
 from dem.shapes import placed
-from dem.start import even_slice, new_world, restart_rows, restored_world, stiffness, time_step
+from dem.start import even_slice, new_world, refuse_overlap, restart_rows, restored_world, stiffness, time_step
 from dem.step.impulses import ImpulseMemory
 from dem.together import SceneError, together, unlike
 from pctt import ccp
@@ -35,7 +35,8 @@ from pctt.disk import FileError, Lock, on_first, read, same_rows, texts, write_r
 from pctt.options import OptionError
 from pctt.petsc import warn
 from pctt.run import interrupt
-from pctt.run.settings import Settings, scene_name
+from pctt.run.relax import relax
+from pctt.run.settings import RELAX, Settings, scene_name
 from pctt.run.stepper import Stepper
 
 CONTACTS = ("contacts/key", "contacts/impulse")  #: the data sets that have a row for each contact
@@ -68,11 +69,12 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     large = scene.large_bodies
     motions = [(body.name, type(body.motion).__name__) for body in large]
     words: list[Any] = [scene.materials, sorted(scene.leaving), motions, repr(scene.passages)]
-    words.append([(part.count, part.kind, part.material) for part in scene.parts])
+    words.append([(part.count, part.kind) for part in scene.parts])
     named = [(kind, name, vars(part)) for kind, there in scene.named.items() for name, part in there.items()]
     words += [(kind, name, [repr(each) for each in given.values() if not _numeric(each) and not callable(each)])
               for kind, name, given in named]  # fmt: skip
     numbers: list[Any] = [column.sample() for part in scene.parts for column in part.given.values()]
+    numbers += [part.material for part in scene.parts]
     numbers += scene.large().columns().values()
     numbers += [value for body in large for shape in body.shapes for value in placed(shape)]
     numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values(), *(body.surface for body in large)]
@@ -86,12 +88,22 @@ def _numeric(value: Any) -> bool:
     return np.asarray(value).dtype.kind in "fiub"
 
 
-def world_at_start(experiment: Experiment, scene: Scene, comm: MPI.Comm) -> World:
+def world_at_start(experiment: Experiment, settings: Settings, scene: Scene, comm: MPI.Comm) -> World:
     """What the experiment built, at time zero; OptionError if it cannot start so."""
+    name = type(experiment).__name__
     try:
-        return new_world(scene, comm)
+        world = new_world(scene, comm, math.inf)
     except (ValueError, FloatingPointError) as error:  # the latter of velocities whose squares overflow
-        raise OptionError(f"scene {type(experiment).__name__}: {error}") from None
+        raise OptionError(f"scene {name}: {error}") from None
+    if settings.overlap == RELAX:
+        relax(world, scene, settings)
+        return world
+    try:
+        refuse_overlap(world, float(settings.overlap))
+    except ValueError as error:
+        helps = "-overlap relax opens overlaps before the first step, a number allows greater ones"
+        raise OptionError(f"scene {name}: {error}. What helps: {helps}") from None
+    return world
 
 
 # -- checkpoints ---------------------------------------------------------------------------------------------
@@ -143,6 +155,38 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
     write_rows(path, world.comm, rows, shared, {"/": {"format": FORMAT, **made_with}})
 
 
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """The state of a run on this rank, in the place of a checkpoint: arrays that no step changes."""
+
+    local: dict[str, np.ndarray]  #: rows of grains
+    replicated: dict[str, np.ndarray]
+    changed: str  #: of `dem.model.changes.changes`
+    impulses: tuple[np.ndarray, ...]  #: keys and impulses of the last step's contacts
+
+
+def kept(world: World, memory: ImpulseMemory) -> Kept:
+    """The state of a world now."""
+    local, replicated = ({name: array.copy() for name, array in arrays.items()} for arrays in world.state())
+    return Kept(local, replicated, changes(world), tuple(array.copy() for array in memory.state()))
+
+
+def restored(kept: Kept, scene: Scene, comm: MPI.Comm, times: float = 1.0) -> tuple[World, ImpulseMemory]:
+    """The world and the impulses, so many ``times`` as great, of a state of the scene on as many ranks; collective.
+    ValueError and others for what is none."""
+    world = restored_world(scene, comm, kept.local, kept.replicated)
+    restore(world, kept.changed)
+    memory, (key, impulse) = ImpulseMemory(comm, world.pairs.parts, world.pairs.columns), kept.impulses
+    right = np.isfinite(impulse).all() and impulse.shape == (len(key), memory.width)
+    right = right and len(np.unique(key)) == len(key)
+    refuse(comm, "" if right else "impulses of contacts that are no numbers, or two of one contact")
+    if times != 1.0:
+        impulse = impulse.copy()
+        impulse[:, : 4 * world.pairs.parts] *= times
+    memory.restore(key, impulse)
+    return world, memory
+
+
 def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) -> tuple[World, ImpulseMemory]:
     """The world and the impulses of a checkpoint of the scene; collective.
 
@@ -167,19 +211,11 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
 
     old, scene_of, replicated, changed, local, impulses = read(path, comm, take)
     _refuse_other_origin(path, old, scene_of, made_with, comm)
+    times = 1.0 if old["dt"] == made_with["dt"] else made_with["dt"] / old["dt"]
     try:
-        world = restored_world(scene, comm, local, replicated)
-        restore(world, changed)
-        memory, (key, impulse) = ImpulseMemory(comm, world.pairs.parts, world.pairs.columns), impulses
-        right = np.isfinite(impulse).all() and impulse.shape == (len(key), memory.width)
-        right = right and len(np.unique(key)) == len(key)
-        refuse(comm, "" if right else "impulses of contacts that are no numbers, or two of one contact")
+        return restored(Kept(local, replicated, changed, impulses), scene, comm, times)
     except (AttributeError, KeyError, TypeError, ValueError) as error:  # of another scene file
         raise OptionError(f"-restart {path}: {error}") from None
-    if old["dt"] != made_with["dt"]:
-        impulse[:, : 4 * world.pairs.parts] *= made_with["dt"] / old["dt"]
-    memory.restore(key, impulse)
-    return world, memory
 
 
 def _refuse_other_format(file: h5py.File) -> None:
@@ -227,6 +263,8 @@ def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_
         "stiffness": stiffness.pairs(scene).stiffness.tolist(),
         "tol": settings.settle_tol,
     }
+    if settings.overlap != Settings.overlap:
+        how["overlap"] = settings.overlap
     if experiment.digest:
         how["file"] = experiment.digest  # a file that was changed may build another scene
     if surfaces := json.loads(made_with["surfaces"]):
@@ -300,7 +338,9 @@ def _settle(
     end = math.ceil(experiment.settling_time / dt * (1 - 1e-12))
     tenth, tol, begun = max(1, end // 10), settings.settle_tol, time.perf_counter()
     say(f"settling {scene_name(experiment)}, {end} steps with APGD to {tol:g}:")
-    world = world_at_start(experiment, scene, comm)
+    loose = Settings(dt=dt, delta=falling, solver="apgd", tol=tol, law=ccp.RELAXATION, overlap=settings.overlap)
+    loose = loose.of(experiment)
+    world = world_at_start(experiment, loose, scene, comm)
     memory = ImpulseMemory(comm, world.pairs.parts, world.pairs.columns)
     if comm.bcast(unfinished(path).exists()):
         try:
@@ -308,7 +348,6 @@ def _settle(
             say(f"  goes on after step {world.step}, from {unfinished(path)}")
         except FileError as error:
             say(f"  {error}; settled from the beginning")
-    loose = Settings(dt=dt, delta=falling, solver="apgd", tol=tol, law=ccp.RELAXATION).of(experiment)
     with Stepper(loose, world, memory) as stepper:
         while world.step < end:
             if world.step + 1 >= end - end // 10:

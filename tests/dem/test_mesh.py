@@ -286,8 +286,8 @@ def test_files_are_read_written_scaled_and_refused(tmp_path):
     (tmp_path / "words.stl").write_text("no mesh")
     (tmp_path / "cut.stl").write_bytes((tmp_path / "wheel.stl").read_bytes()[:1000])
     for name, words in (
-        ("words.stl", "words.stl: (cannot be read as a mesh|has no triangle)"),
-        ("cut.stl", "cut.stl: cannot be read as a mesh"),
+        ("words.stl", "words.stl: cannot be read as a mesh .*neither an STL file of text"),
+        ("cut.stl", "cut.stl: cannot be read as a mesh .*says that it has 64 triangles, but only 18"),
         ("none.stl", "none.stl: no such file"),
     ):
         with pytest.raises(ValueError, match=words):
@@ -296,10 +296,71 @@ def test_files_are_read_written_scaled_and_refused(tmp_path):
         Mesh.read(tmp_path / "wheel.stl", 0.0)
 
 
+TETRAHEDRON = np.array([(0, 0, 0), (3, 0, 0), (0, 2, 0), (0, 0, 1)], float)
+FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+
+
+def binary_stl(count=4, head=b"solid by some program", corners=TETRAHEDRON):
+    rows = np.zeros(4, [("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("colour", "<u2")])
+    rows["corner"] = corners[FACES]
+    return head.ljust(80) + np.uint32(count).tobytes() + rows.tobytes()
+
+
+def text_stl(name="part", corners=TETRAHEDRON):
+    lines = [f"solid {name}"]
+    for face in FACES:
+        lines += [" facet normal 0 0 0", "  outer loop"]
+        lines += ["   vertex {:.7e} {:.7e} {:.7e}".format(*corner) for corner in corners[[*face]]]
+        lines += ["  endloop", " endfacet"]
+    return "\n".join([*lines, f"endsolid {name}", ""]).encode()
+
+
+@pytest.mark.parametrize("data", [
+    binary_stl(), binary_stl() + bytes(21), text_stl(), text_stl().replace(b"\n", b"\r"), text_stl().upper(),
+    text_stl().replace(b"\n", b"\r\n"), text_stl().replace(b".", b","), b"\xef\xbb\xbf\n" + text_stl(),
+    text_stl("vertex of a caf\xe9" * 40), binary_stl(corners=TETRAHEDRON * 1e-25),
+    binary_stl(corners=TETRAHEDRON + 4096),
+], ids=range(11))  # fmt: skip
+def test_stl_files_of_other_programs_are_read_whole(tmp_path, data):
+    (tmp_path / "a.STL").write_bytes(data)
+    mesh = Mesh.read(tmp_path / "a.STL")
+    assert (len(mesh.triangles), len(mesh.vertices)) == (4, 4)
+    spans = np.ptp(mesh.vertices, axis=0)
+    np.testing.assert_allclose(spans / spans[2], [3, 2, 1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("data", "words"), [
+    (binary_stl()[:-1], "says that it has 4 triangles, but only 3 are there: it is truncated"),
+    (binary_stl(2), "says that it has 2 triangles, but 100 bytes follow them"),
+    (binary_stl(corners=np.where(TETRAHEDRON == 2, np.nan, TETRAHEDRON)), "triangle 1 of 4 has a corner that is NaN"),
+    (text_stl()[:-40], "line 27: it ends with 12 corners of 4 triangles and 0 endsolid: it is truncated"),
+    (text_stl().replace(b"3.0000000e+00", b"inf", 1), "line 6: 'vertex inf .*allowed are three finite numbers"),
+    (b"", "the file is empty"),
+    (b"solid a\nendsolid a\n", "has no triangle"),
+], ids=range(7))  # fmt: skip
+def test_damaged_stl_files_are_refused_with_the_place(tmp_path, data, words):
+    (tmp_path / "a.stl").write_bytes(data)
+    with pytest.raises(ValueError, match=f"a.stl: .*{words}"):
+        Mesh.read(tmp_path / "a.stl")
+
+
+def test_a_closed_solid_with_texture_has_a_mass(tmp_path):
+    """Its corners have other texture coordinates in each face, so that a reader makes three vertices of one place."""
+    pytest.importorskip("trimesh")
+    lines = ["v {} {} {}".format(*corner) for corner in TETRAHEDRON] + [f"vt 0.{k} 0.5" for k in range(12)]
+    lines += ["mtllib none.mtl", "usemtl red"]
+    lines += ["f " + " ".join(f"{v + 1}/{3 * n + k + 1}" for k, v in enumerate(face)) for n, face in enumerate(FACES)]
+    (tmp_path / "solid.obj").write_text("\n".join(lines))
+    mesh = Mesh.read(tmp_path / "solid.obj")
+    assert len(mesh.vertices) == 4
+    np.testing.assert_allclose(mass_properties([mesh], 1000.0)[0], 1000.0)
+
+
 def test_without_trimesh_a_mesh_has_contacts_but_no_mass_and_no_file(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     assert len(on(block(), [0, 0, 0.39], 0.1).pair) == 1
-    for call in (lambda: Mesh.read(tmp_path / "block.stl"), lambda: mass_properties([block()], 1.0)):
+    (tmp_path / "block.obj").write_text("v 0 0 0\n")
+    for call in (lambda: Mesh.read(tmp_path / "block.obj"), lambda: mass_properties([block()], 1.0)):
         with pytest.raises(ValueError, match="by trimesh, which is not there: pip install"):
             call()
 

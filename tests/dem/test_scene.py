@@ -48,7 +48,7 @@ def body(*arguments, **options):
         (lambda scene: scene.set_pair("a", "b", friction=-0.1), "friction must not be negative"),
         (lambda scene: Scene(friction=0.1, gravity=(0, 0, np.nan)), "gravity: NaN"),
         (body("floor", FLOOR), "distinct names, got 'floor'"),
-        (body("empty", []), "has no shape"),
+        (body("empty", []), "allowed is a list of one or more"),
         (body("press", [Box((1, 1, 1))], Dynamic()), "needs either its density or both mass and inertia"),
         (body("press", [Box((1, 1, 1))], Dynamic(), mass=-1.0, inertia=(1, 1, 1)), "mass of 'press' must be positive"),
         (body("press", FLOOR, Dynamic(), density=100.0), "half space has no finite mass"),

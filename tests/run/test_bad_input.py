@@ -28,6 +28,7 @@ BAD_OPTIONS = {
     "-recovery_speed nan": ["nan", ">= 0"],
     "-checkpoint_every 0": ["0", ">= 1"],
     "-settle maybe": ["maybe", "true or false"],
+    "-overlap -1": ["-1", "a number >= 0, or relax"],
     "-scene nosuch": ["nosuch", "mixer"],
     "-scene_n 0": ["0", "at least 1"],
     "-scene_radius nan": ["nan", "finite number"],
