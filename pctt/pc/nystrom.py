@@ -26,8 +26,9 @@ from pctt.tt.train import Array
 from pctt.tt.work import ENTRY, MULTIPLY
 
 BLOCK = 64  # columns that are drawn at a time
-PROBE, LEAST, PART = 12, 3, 0.12  # steps of a trial, at most and at least, and the part of a solution that ends it
-FEW = 10  # iterations that need no trial
+PROBE, LEAST, PART = 12, 3, 0.1  # steps of a trial, at most and at least, and the part of a solution that ends it
+FEW = 20  # iterations that need no trial
+GAIN = 1.3  # of block Jacobi, in iterations, with which it is taken
 MANY = 1e5  # iterations that are as bad as none
 EASY = 40  # a solution with fewer iterations needs nothing better
 OPENING, MOST = 0.08, 0.25  # parts of the operations of a solution, for the first columns and for as many again
@@ -296,7 +297,8 @@ def choose(P: PETSc.Mat, A: PETSc.Mat, product: float) -> Chosen:
     jacobi = block_jacobi(P)
     shown = trial(A, [None] if jacobi is None else [None, jacobi])
     alone, scaled, spent = shown.iterations[0], shown.iterations[-1], shown.spent
-    best = Chosen(None, scaled <= alone, 0.0, min(scaled, alone), alone)
+    gains = jacobi is None or GAIN * scaled <= alone
+    best = Chosen(None, gains, 0.0, scaled if gains and jacobi is not None else alone, alone)
     rows = P.getSize()[0]
     most = int(min(LARGEST, rows // 4, NUMBERS // rows))
     budget = OPENING * best.cost * product / (ENTRY * rows)

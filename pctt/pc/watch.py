@@ -12,13 +12,14 @@ from pctt.tt.train import Array
 
 AT_LEAST = 24.0  # products of trials and a solution that are too few to be watched
 PROBE = 6  # steps of conjugate gradients alone that show what they take for this right side
-HOPELESS = 2.0  # times what the KSP takes
+GROWTH = 2.0  # the whole may take so many times what a part of it did
+HOPELESS = 1.2  # times what the KSP takes
 
 
 class Watch:
     """A solve by a KSP. `count` is called before each application of the preconditioner.
 
-    Once trials and applications have cost more than a trial has promised, or than conjugate gradients alone are known
+    Once trials and applications have cost GROWTH times what a trial has promised, or than conjugate gradients alone are known
     to take, these solve the same system in turns with the KSP, as long as they have cost less than it, and their
     residuals do not show that they need HOPELESS times what the KSP's residuals show of it. If they have the solution
     first, the KSP ends with its next test, and `solution` is theirs: all in all not more than twice what they take
@@ -40,7 +41,7 @@ class Watch:
         self._digits = log10(norm / self._enough) if 0 < self._enough < norm else 16.0 if norm else 0.0
         cost, alone = promise.cost(self._digits), at_least(promise.alone, self._digits)
         self._trials, self._norms = spent, [0.0]
-        self._expected = max(AT_LEAST, min(spent + cost, alone))
+        self._expected = max(AT_LEAST, min(spent + GROWTH * cost, alone))
         self._alone: ConjugateGradients | None = None
 
     @staticmethod

@@ -34,10 +34,11 @@ from pctt.tt.train import Array
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
 #: Shares of the points of a grid, and the most points, on which solutions are tried: all, then the best of them.
 SHARES = ((1 / 100, 1024), (1 / 40, 4096))
-LEAST, ROWS = 64, 3  # points, of which a grid has as many parts; rows of points of a periodic axis
+LEAST, FEWEST, ROWS = 64, 24, 3  # points, if they are a fortieth of all; in any case; rows along a periodic axis
 NEARLY = 0.05  # a periodic function may change so much in a period
-PART = 0.15  # points of all trials, over those of a solution: as many kinds are tried
+PART = 0.2  # points of all trials, over those of a solution: as many kinds are tried
 SLACK = 1.3  # a preconditioner that costs so many times more than another one on a part is not tried further
+SMALL, LEAD = 512, 1.6  # points of parts that show a circulant worse than it is, if a kernel is not even; how much
 MOST = 1000.0  # products that a trial may cost
 EASY = 3.0  # condition with which a small matrix needs no preconditioner
 
@@ -337,11 +338,11 @@ def parts(a: Differences, share: float) -> list[Differences]:
     whole, if they are short enough. A small grid is no smaller part.
     """
     shape, size = a.shape, prod(a.shape)
-    whole = [far <= NEARLY and ROWS * n <= size / 8 for n, far in zip(shape, a.aperiodic)]
+    whole = [far <= NEARLY and ROWS * n <= size / 30 for n, far in zip(shape, a.aperiodic)]
     if all(whole):
         whole = [False] * len(shape)
     rows = ROWS * prod(n for n, all_ in zip(shape, whole) if all_) if any(whole) else 0
-    points = max(size * share, LEAST, rows)
+    points = max(size * share, min(max(size / 40, FEWEST), LEAST), rows)
     if size <= points:
         return [a]
     sides, left, axes = list(shape), points / prod(n for n, all_ in zip(shape, whole) if all_), len(shape) - sum(whole)
@@ -386,8 +387,9 @@ def choose(a: Differences) -> Choice | None:
         alone = max((alone, *(trial.runs[NOTHING].norms for trial in trials if NOTHING in trial.runs)), key=at_least)
         costs = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}  # the harder part counts
         scores = {kind: cost * max(1.0, cost / scores.get(kind, cost)) for kind, cost in costs.items()}
-        kinds = sorted(kinds, key=lambda kind: scores[kind])
-        kinds = [kind for kind in kinds if scores[kind] <= SLACK * scores[kinds[0]]]
+        lead = {CIRCULANT: LEAD} if not a.even and points < SMALL else {}
+        order = {kind: scores[kind] / lead.get(kind, 1.0) for kind in kinds}
+        kinds = [kind for kind in sorted(kinds, key=lambda kind: order[kind]) if order[kind] <= SLACK * min(order.values())]
     found = kinds[0]
     if not trials:
         inverse = FastInverse(a, found)
