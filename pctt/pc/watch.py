@@ -13,6 +13,7 @@ from pctt.tt.train import Array
 AT_LEAST = 24.0  # products of trials and a solution that are too few to be watched
 PROBE = 6  # steps of conjugate gradients alone that show what they take for this right side
 GROWTH = 2.0  # the whole may take so many times what a part of it did
+PATIENCE = 4.0  # what a preconditioner may cost, in costs that its trial has shown
 HOPELESS = 1.2  # times what the KSP takes
 
 
@@ -21,7 +22,7 @@ class Watch:
 
     Once trials and applications have cost GROWTH times what a trial has promised, or than conjugate gradients alone are known
     to take, these solve the same system in turns with the KSP, as long as they have cost less than it, and their
-    residuals do not show that they need HOPELESS times what the KSP's residuals show of it. If they have the solution
+    residuals do not show that they need HOPELESS times what those of a KSP show that keeps its promise within PATIENCE. If they have the solution
     first, the KSP ends with its next test, and `solution` is theirs: all in all not more than twice what they take
     alone, plus AT_LEAST. Costs are counted, not measured, and all ranks decide by the same norms.
 
@@ -62,9 +63,11 @@ class Watch:
         if self._alone is None:
             A = self.ksp.getOperators()[0]
             self._alone = conjugate_gradients(A, self._b.array_r, x=self._start, sign=self._sign)
-        run, least = self._alone, [norm for norm in self._norms if norm > 0]
-        gained = log10(max(least) / min(least)) if least else 0.0
-        lost = HOPELESS * cost * self._digits / gained if gained > 0 else inf
+        # PETSc has no norm of this solve before the second application
+        run, first, last = self._alone, *(self._norms[k] for k in (2, -1))
+        gained = log10(first / last) if first > last > 0 else 0.0
+        needs = cost * self._digits / gained if gained > 0 else inf
+        lost = HOPELESS * needs if needs <= PATIENCE * self.promise.cost(self._digits) else inf
         while run.cost < self._trials + cost and run.norms[-1] > self._enough and not run.failed:
             if self.products >= PROBE and iterations(run.norms, self._digits) > lost:
                 break

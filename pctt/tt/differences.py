@@ -40,6 +40,7 @@ PART = 0.2  # points of all trials, over those of a solution: as many kinds are 
 SLACK = 1.3  # a preconditioner that costs so many times more than another one on a part is not tried further
 SMALL, LEAD = 512, 1.6  # points of parts that show a circulant worse than it is, if a kernel is not even; how much
 MOST = 1000.0  # products that a trial may cost
+UNTRIED = [1.0, 0.5]  # norms that stand for those of a trial
 EASY = 3.0  # condition with which a small matrix needs no preconditioner
 
 #: What is tried: the transforms of which the mean of the inverses is taken, and their shares.
@@ -396,7 +397,7 @@ def choose(a: Differences) -> Choice | None:
         if not inverse.positive:
             return None
         easy = inverse.condition < EASY
-        return Choice(NOTHING if easy else found, Promise(0.0 if easy else inverse.each, [1.0, 0.0], alone))
+        return Choice(NOTHING if easy else found, Promise(0.0 if easy else inverse.each, UNTRIED, alone))
     hard = max(trials, key=lambda trial: trial.costs[found])
     return Choice(found, Promise(hard.runs[found].each, hard.runs[found].norms, alone, spent / prod(a.shape)))
 
