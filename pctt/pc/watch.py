@@ -13,7 +13,7 @@ from pctt.tt.train import Array
 AT_LEAST = 24.0  # products of trials and a solution that are too few to be watched
 PROBE = 6  # steps of conjugate gradients alone that show what they take for this right side
 GROWTH = 2.0  # the whole may take so many times what a part of it did
-PATIENCE = 4.0  # what a preconditioner may cost, in costs that its trial has shown
+PATIENCE = 8.0  # what a preconditioner may cost, in costs that its trial has shown
 HOPELESS = 1.2  # times what the KSP takes
 
 
