@@ -124,3 +124,11 @@ def test_residual_of_high_ranks_is_estimated(monkeypatch: pytest.MonkeyPatch) ->
     measured = tt.residual(S, X)
     monkeypatch.setattr(inverse, "HIGH", 0)
     assert tt.residual(S, X) == pytest.approx(measured, rel=0.5)
+
+
+def test_within_a_limit_of_operations_a_higher_rank_is_not_worse():
+    """The ranks do not grow beyond what later passes can make use of."""
+    size = np.arange(700)
+    T = decompose_matrix(1 / (1 + np.add.outer(size, size)) / 2e-3, [7, 10, 10])
+    left = [invert_near_identity(T, rank, eps=1e-4, work=Work(3e8)).residual for rank in (20, 100)]
+    assert left[1] <= 1.1 * left[0]
