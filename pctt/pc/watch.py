@@ -20,11 +20,12 @@ HOPELESS = 1.2  # times what the KSP takes
 class Watch:
     """A solve by a KSP. `count` is called before each application of the preconditioner.
 
-    Once trials and applications have cost GROWTH times what a trial has promised, or than conjugate gradients alone are known
-    to take, these solve the same system in turns with the KSP, as long as they have cost less than it, and their
-    residuals do not show that they need HOPELESS times what those of a KSP show that keeps its promise within PATIENCE. If they have the solution
-    first, the KSP ends with its next test, and `solution` is theirs: all in all not more than twice what they take
-    alone, plus AT_LEAST. Costs are counted, not measured, and all ranks decide by the same norms.
+    Once trials and applications have cost GROWTH times what a trial has promised, or than conjugate gradients alone are
+    known to take, these solve the same system in turns with the KSP, as long as they have cost less than it. They wait
+    where residuals show that they need HOPELESS times what the KSP does, and that this is PATIENCE times its promise at
+    most. If they have the solution first, the KSP ends with its next test, and `solution` is theirs: if they never
+    waited, all is not more than twice what they take alone, plus AT_LEAST. Costs are counted, not measured, and all
+    ranks decide by the same norms.
 
     sign : -1 where the matrix is negative definite
     spent : what trials for this solve have cost, in products

@@ -305,8 +305,8 @@ def _along_last(a: Array, kind: str) -> Array:
 
 
 def _inverse(values: Array, bound: float | None) -> tuple[Array, bool, float]:
-    """The inverses of Hermitian blocks (..., b, b), whether all are positive, and the condition of all. Eigenvalues less
-    than a bound count as it."""
+    """The inverses of Hermitian blocks (..., b, b), whether all are positive, and the condition of all. Less than a bound
+    counts as it."""
     if values.shape[-1] == 1:
         vectors, values = None, values[..., 0]
     else:
@@ -390,7 +390,8 @@ def choose(a: Differences) -> Choice | None:
         scores = {kind: cost * max(1.0, cost / scores.get(kind, cost)) for kind, cost in costs.items()}
         lead = {CIRCULANT: LEAD} if not a.even and points < SMALL else {}
         order = {kind: scores[kind] / lead.get(kind, 1.0) for kind in kinds}
-        kinds = [kind for kind in sorted(kinds, key=lambda kind: order[kind]) if order[kind] <= SLACK * min(order.values())]
+        kinds = sorted(kinds, key=lambda kind: order[kind])
+        kinds = [kind for kind in kinds if order[kind] <= SLACK * order[kinds[0]]]
     found = kinds[0]
     if not trials:
         inverse = FastInverse(a, found)
