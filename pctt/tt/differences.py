@@ -28,7 +28,7 @@ from math import inf, prod
 import numpy as np
 from scipy import fft
 
-from pctt.tt.conjugate import DIGITS, ConjugateGradients, Promise, at_least, race
+from pctt.tt.conjugate import ConjugateGradients, Promise, at_least, race
 from pctt.tt.train import Array
 
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
@@ -305,8 +305,8 @@ def _along_last(a: Array, kind: str) -> Array:
 
 
 def _inverse(values: Array, bound: float | None) -> tuple[Array, bool, float]:
-    """The inverses of Hermitian blocks (..., b, b), whether all are positive, and the condition of all. Less than a bound
-    counts as it."""
+    """The inverses of Hermitian blocks (..., b, b), whether all are positive, and the condition of all. Less than a
+    bound counts as it."""
     if values.shape[-1] == 1:
         vectors, values = None, values[..., 0]
     else:
