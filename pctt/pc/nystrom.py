@@ -26,7 +26,9 @@ from pctt.tt.train import Array
 from pctt.tt.work import ENTRY, MULTIPLY
 
 BLOCK = 64  # columns that are drawn at a time
-PROBE, LEAST, PART = 12, 3, 0.25  # steps of a trial, at most and at least, and the part of a solution that ends it
+PROBE, LEAST, PART = 12, 3, 0.1  # steps of a trial, at most and at least, and the part of a solution that ends it
+FEW = 20  # iterations that need no trial
+GAIN = 1.3  # of block Jacobi, in iterations, with which it is taken
 MANY = 1e5  # iterations that are as bad as none
 EASY = 40  # a solution with fewer iterations needs nothing better
 OPENING, MOST = 0.08, 0.25  # parts of the operations of a solution, for the first columns and for as many again
@@ -244,18 +246,20 @@ def estimate(run: ConjugateGradients) -> float:
 
 
 def trial(A: PETSc.Mat, solves: Sequence[Callable[[Array], Array] | None], each: float = 0.0) -> Trial:
-    """A few steps of conjugate gradients for A with each of these preconditioners, until they have cost a fourth of a
-    solution; collective.
+    """A few steps of conjugate gradients for A with each of these preconditioners, until they have cost PART of a
+    solution; without one no further if that takes a FEW iterations. Collective.
 
     each : the cost of an application of a preconditioner, that of a product is 1
     """
     first, last = A.getOwnershipRange()
     b, comm = np.random.default_rng(0).standard_normal(A.getSize()[0])[first:last], A.comm.tompi4py()
     runs = [conjugate_gradients(A, b, solve, 0.0 if solve is None else each) for solve in solves]
-    found: list[float] = []
+    found, spent = [], 0.0
     for k in range(PROBE):
         for run in runs:
             run.step()
+            if run.solve is None and k < LEAST and iterations(run.norms) <= FEW:
+                return Trial([iterations(run.norms), np.inf], spent + 1)
         spent = sum(run.cost for run in runs)
         found = comm.bcast([estimate(run) for run in runs])
         if k >= LEAST - 1 and spent >= PART * min(found):
@@ -293,7 +297,8 @@ def choose(P: PETSc.Mat, A: PETSc.Mat, product: float) -> Chosen:
     jacobi = block_jacobi(P)
     shown = trial(A, [None] if jacobi is None else [None, jacobi])
     alone, scaled, spent = shown.iterations[0], shown.iterations[-1], shown.spent
-    best = Chosen(None, scaled <= alone, 0.0, min(scaled, alone), alone)
+    gains = jacobi is None or GAIN * scaled <= alone
+    best = Chosen(None, gains, 0.0, scaled if gains and jacobi is not None else alone, alone)
     rows = P.getSize()[0]
     most = int(min(LARGEST, rows // 4, NUMBERS // rows))
     budget = OPENING * best.cost * product / (ENTRY * rows)

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-from math import log10
+from math import inf, log10
 
 from petsc4py import PETSc
 
 from pctt.pc.mat import conjugate_gradients
-from pctt.tt.conjugate import PATIENCE, ConjugateGradients, Promise, at_least, iterations
+from pctt.tt.conjugate import ConjugateGradients, Promise, at_least, iterations
 from pctt.tt.train import Array
 
 AT_LEAST = 24.0  # products of trials and a solution that are too few to be watched
 PROBE = 6  # steps of conjugate gradients alone that show what they take for this right side
+GROWTH = 2.0  # the whole may take so many times what a part of it did
+PATIENCE = 8.0  # what a preconditioner may cost, in costs that its trial has shown
+HOPELESS = 1.2  # times what the KSP takes
 
 
 class Watch:
     """A solve by a KSP. `count` is called before each application of the preconditioner.
 
-    Once trials and applications have cost as much as conjugate gradients alone are known to take, these solve the same
-    system in turns with the KSP, each as many products as the other. If they have the solution first, the KSP ends with
-    its next test, and `solution` is theirs: all in all not more than twice what they take alone, plus AT_LEAST. What
-    they are known to take is the least of what they took on a part of the matrix, and what their first steps with this
-    right side show; a preconditioner that has cost PATIENCE times what its trial has shown waits for neither. Costs are
-    counted, not measured, and all ranks decide by the same norms.
+    Once trials and applications have cost GROWTH times what a trial has promised, or than conjugate gradients alone are
+    known to take, these solve the same system in turns with the KSP, as long as they have cost less than it. They wait
+    where residuals show that they need HOPELESS times what the KSP does, and that this is PATIENCE times its promise at
+    most. If they have the solution first, the KSP ends with its next test, and `solution` is theirs: if they never
+    waited, all is not more than twice what they take alone, plus AT_LEAST. Costs are counted, not measured, and all
+    ranks decide by the same norms.
 
     sign : -1 where the matrix is negative definite
     spent : what trials for this solve have cost, in products
@@ -39,8 +42,8 @@ class Watch:
         self._enough = max(ksp.rtol * norm, ksp.atol)
         self._digits = log10(norm / self._enough) if 0 < self._enough < norm else 16.0 if norm else 0.0
         cost, alone = promise.cost(self._digits), at_least(promise.alone, self._digits)
-        self._spent, self._expected = spent, max(AT_LEAST, min(spent + cost, alone))
-        self._patience = max(AT_LEAST, min(PATIENCE * cost, alone))
+        self._trials, self._norms = spent, [0.0]
+        self._expected = max(AT_LEAST, min(spent + GROWTH * cost, alone))
         self._alone: ConjugateGradients | None = None
 
     @staticmethod
@@ -54,26 +57,25 @@ class Watch:
 
     def count(self) -> None:
         """Collective."""
-        self._spent += 1 + self.promise.each
-        if self._spent <= self._expected or self.solution is not None:
+        self._norms.append(self.ksp.getResidualNorm())
+        cost = (len(self._norms) - 1) * (1 + self.promise.each)
+        if self._trials + cost <= self._expected or self.solution is not None:
             return
         if self._alone is None:
             A = self.ksp.getOperators()[0]
             self._alone = conjugate_gradients(A, self._b.array_r, x=self._start, sign=self._sign)
-            self._go_on(PROBE)
-            self._patience = min(self._patience, iterations(self._alone.norms, self._digits))
-        if self._spent > self._patience:
-            self._go_on(self._spent)
-        if self._alone.norms[-1] <= self._enough:
-            self.solution = self._alone.x
-            self.ksp.max_it = 1
-
-    def _go_on(self, products: float) -> None:
-        """With conjugate gradients alone, until they have cost so many products."""
-        run = self._alone
-        assert run is not None
-        while run.cost < products and run.norms[-1] > self._enough and not run.failed:
+        # PETSc has no norm of this solve before the second application
+        run, first, last = self._alone, *(self._norms[k] for k in (2, -1))
+        gained = log10(first / last) if first > last > 0 else 0.0
+        needs = cost * self._digits / gained if gained > 0 else inf
+        lost = HOPELESS * needs if needs <= PATIENCE * self.promise.cost(self._digits) else inf
+        while run.cost < self._trials + cost and run.norms[-1] > self._enough and not run.failed:
+            if self.products >= PROBE and iterations(run.norms, self._digits) > lost:
+                break
             run.step()
+        if run.norms[-1] <= self._enough:
+            self.solution = run.x
+            self.ksp.max_it = 1
 
     def end(self) -> None:
         """Give the KSP its limit of iterations back."""

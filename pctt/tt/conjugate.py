@@ -12,7 +12,6 @@ from pctt.tt.train import Array
 
 Product = Callable[[Array], Array]
 DIGITS = 8.0  # of the residual, that a solution gains
-PATIENCE = 4.0  # what a preconditioner may cost, in costs that its trial has shown
 
 
 class ConjugateGradients:

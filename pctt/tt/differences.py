@@ -28,27 +28,33 @@ from math import inf, prod
 import numpy as np
 from scipy import fft
 
-from pctt.tt.conjugate import DIGITS, PATIENCE, ConjugateGradients, Promise, at_least, race
+from pctt.tt.conjugate import ConjugateGradients, Promise, at_least, race
 from pctt.tt.train import Array
 
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
 #: Shares of the points of a grid, and the most points, on which solutions are tried: all, then the best of them.
 SHARES = ((1 / 100, 1024), (1 / 40, 4096))
-LEAST, ROWS = 64, 3  # points; rows of points of a periodic axis
+LEAST, FEWEST, ROWS = 64, 24, 3  # points, if they are a fortieth of all; in any case; rows along a periodic axis
 NEARLY = 0.05  # a periodic function may change so much in a period
-FINALISTS, FAR = 4, 2.5  # number of those, and what they may cost beside the best of them
+PART = 0.2  # points of all trials, over those of a solution: as many kinds are tried
 SLACK = 1.3  # a preconditioner that costs so many times more than another one on a part is not tried further
+SMALL, LEAD = 512, 2.0  # points of parts that show a circulant worse than it is, if a kernel is not even; how much
 MOST = 1000.0  # products that a trial may cost
+UNTRIED = [1.0, 0.5]  # norms that stand for those of a trial
+EASY = 3.0  # condition with which a small matrix needs no preconditioner
 
 #: What is tried: the transforms of which the mean of the inverses is taken, and their shares.
 Kind = tuple[tuple[str, float], ...]
 NOTHING: Kind = ()
 BLOCK_DIAGONAL: Kind = (("block diagonal", 1.0),)
 CIRCULANT: Kind = (("circulant", 1.0),)
-CANDIDATES: tuple[Kind, ...] = (
-    NOTHING, BLOCK_DIAGONAL, CIRCULANT, (("cosine", 1.0),),
-    (("cosine", 0.75), ("sine", 0.25)), (("cosine", 0.5), ("sine", 0.5)), (("sine", 1.0),), (("embedding", 1.0),),
+COSINE: Kind = (("cosine", 1.0),)
+#: In the order in which they are tried if few can be: for kernels that are even in each coordinate, and for others.
+EVEN: tuple[Kind, ...] = (
+    COSINE, NOTHING, CIRCULANT, (("cosine", 0.5), ("sine", 0.5)), (("cosine", 0.75), ("sine", 0.25)),
+    (("sine", 1.0),), (("embedding", 1.0),), BLOCK_DIAGONAL,
 )  # fmt: skip
+ODD: tuple[Kind, ...] = (CIRCULANT, NOTHING, COSINE, *EVEN[3:])
 #: The cost of an application; that of a product with A is 1.
 COSTS = {"block diagonal": 0.0, "circulant": 0.25, "cosine": 0.25, "sine": 0.25, "embedding": 1.0}
 WORDS = {
@@ -230,6 +236,7 @@ class FastInverse:
     kind : of the mean, one of CANDIDATES
 
     positive : whether all eigenvalues are positive; if not, neither is A
+    condition : the largest eigenvalue of the nearest matrices over the smallest
     name : in words
 
     >>> a = Differences.of_even(0.3 ** np.arange(6.0))
@@ -240,6 +247,7 @@ class FastInverse:
 
     def __init__(self, a: Differences, kind: Kind) -> None:
         self.kind, self.shape, self.block, self.positive = kind, a.shape, a.block, True
+        self.condition = 1.0
         self.each = sum(COSTS[transform] for transform, _ in kind)
         self.name = " and ".join(WORDS[transform] for transform, _ in kind) or "no preconditioner"
         if len(kind) == 2:
@@ -247,8 +255,9 @@ class FastInverse:
         self._factors: list[tuple[str, Array]] = []
         for transform, share in kind:
             values, least = eigenvalues(a, transform)
-            inverse, positive = _inverse(values, least)
+            inverse, positive, condition = _inverse(values, least)
             self.positive &= positive
+            self.condition = max(self.condition, condition)
             self._factors.append((transform, share * inverse))
 
     def solve(self, x: Array) -> Array:
@@ -295,18 +304,20 @@ def _along_last(a: Array, kind: str) -> Array:
     return (even - odd)[..., :n] if kind == "cosine" else (even + odd)[..., 1:]
 
 
-def _inverse(values: Array, bound: float | None) -> tuple[Array, bool]:
-    """The inverses of Hermitian blocks (..., b, b), and whether all are positive. Less than a bound counts as it."""
+def _inverse(values: Array, bound: float | None) -> tuple[Array, bool, float]:
+    """The inverses of Hermitian blocks (..., b, b), whether all are positive, and the condition of all. Less than a
+    bound counts as it."""
     if values.shape[-1] == 1:
         vectors, values = None, values[..., 0]
     else:
         values, vectors = np.linalg.eigh(values)
     largest = float(values.max())
     positive = largest > 0 and (bound is not None or values.min() > -FLOOR * largest)
-    inverse = 1 / np.maximum(values, max(bound or 0.0, FLOOR * abs(largest)) or 1.0)
+    values = np.maximum(values, max(bound or 0.0, FLOOR * abs(largest)) or 1.0)
+    condition, inverse = float(values.max() / values.min()), 1 / values
     if vectors is None:
-        return inverse[..., None], bool(positive)
-    return (vectors * inverse[..., None, :]) @ np.conj(np.swapaxes(vectors, -1, -2)), bool(positive)
+        return inverse[..., None], bool(positive), condition
+    return (vectors * inverse[..., None, :]) @ np.conj(np.swapaxes(vectors, -1, -2)), bool(positive), condition
 
 
 # -- the choice ----------------------------------------------------------------------------------------------
@@ -328,11 +339,11 @@ def parts(a: Differences, share: float) -> list[Differences]:
     whole, if they are short enough. A small grid is no smaller part.
     """
     shape, size = a.shape, prod(a.shape)
-    whole = [far <= NEARLY and ROWS * n <= size / 8 for n, far in zip(shape, a.aperiodic)]
+    whole = [far <= NEARLY and ROWS * n <= size / 30 for n, far in zip(shape, a.aperiodic)]
     if all(whole):
         whole = [False] * len(shape)
     rows = ROWS * prod(n for n, all_ in zip(shape, whole) if all_) if any(whole) else 0
-    points = max(size * share, LEAST, rows)
+    points = max(size * share, min(max(size / 40, FEWEST), LEAST), rows)
     if size <= points:
         return [a]
     sides, left, axes = list(shape), points / prod(n for n, all_ in zip(shape, whole) if all_), len(shape) - sum(whole)
@@ -350,19 +361,22 @@ def parts(a: Differences, share: float) -> list[Differences]:
 def choose(a: Differences) -> Choice | None:
     """The preconditioner with which conjugate gradients cost least; None if A is not positive definite.
 
-    All are tried on small parts of the grid, the best of them on larger parts too. Costs that have grown count as if
-    they grew once more up to the whole.
+    It is found on small parts of the grid, and on larger ones if some are hardly worse; as many are tried as cost PART
+    of a solution. Costs that have grown count as if they grew once more up to the whole. If there is no such part, the
+    first of the kinds is taken, or none for a well-conditioned matrix.
     """
     if max(a.aperiodic) <= 1e-12:  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
         return Choice(CIRCULANT, Promise(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
-    kinds = [kind for kind in CANDIDATES if a.block > 1 or kind != BLOCK_DIAGONAL]
+    kinds = [kind for kind in (EVEN if a.even else ODD) if a.block > 1 or kind != BLOCK_DIAGONAL]
     scores: dict[Kind, float] = {}
     trials: list[_Trial] = []
-    spent = 0.0
+    alone, spent = [1.0], 0.0
     for share, most in SHARES:
         pieces = parts(a, min(share, most / prod(a.shape)))
-        if scores and pieces[0].shape == trials[0].shape:
+        points = sum(prod(part.shape) for part in pieces)
+        kinds = kinds[: max(1, int(PART * prod(a.shape) / points))]
+        if len(kinds) == 1 or (scores and pieces[0].shape == trials[0].shape):
             break
         trials = []
         for part in pieces:
@@ -370,18 +384,22 @@ def choose(a: Differences) -> Choice | None:
             if trial is None:
                 return None
             trials.append(trial)
+        spent += sum(trial.spent for trial in trials)
+        alone = max((alone, *(trial.runs[NOTHING].norms for trial in trials if NOTHING in trial.runs)), key=at_least)
         costs = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}  # the harder part counts
         scores = {kind: cost * max(1.0, cost / scores.get(kind, cost)) for kind, cost in costs.items()}
-        best = sorted(kinds, key=lambda kind: scores[kind])[:FINALISTS]
-        kinds = [kind for kind in kinds if kind == NOTHING or kind in best and scores[kind] <= FAR * scores[best[0]]]
-        spent += sum(trial.spent for trial in trials)
-        if len(kinds) == 1:
-            break
-    found = min(kinds, key=lambda kind: scores[kind])
+        lead = {CIRCULANT: LEAD} if not a.even and points < SMALL else {}
+        order = {kind: scores[kind] / lead.get(kind, 1.0) for kind in kinds}
+        kinds = sorted(kinds, key=lambda kind: order[kind])
+        kinds = [kind for kind in kinds if order[kind] <= SLACK * order[kinds[0]]]
+    found = kinds[0]
+    if not trials:
+        inverse = FastInverse(a, found)
+        if not inverse.positive:
+            return None
+        easy = inverse.condition < EASY
+        return Choice(NOTHING if easy else found, Promise(0.0 if easy else inverse.each, UNTRIED, alone))
     hard = max(trials, key=lambda trial: trial.costs[found])
-    spent -= sum(trial.spent for trial in trials)
-    alone = max((trial.alone(hard.costs[found]) for trial in trials), key=at_least)
-    spent += sum(trial.spent for trial in trials)
     return Choice(found, Promise(hard.runs[found].each, hard.runs[found].norms, alone, spent / prod(a.shape)))
 
 
@@ -411,13 +429,6 @@ class _Trial:
     @property
     def spent(self) -> float:
         return prod(self.shape) * sum(run.cost for run in self.runs.values())
-
-    def alone(self, cost: float) -> Sequence[float]:
-        """The norms without a preconditioner, until they have cost PATIENCE times as much as this."""
-        alone, most = self.runs[NOTHING], PATIENCE * cost
-        while not alone.failed and alone.norms[-1] > alone.norms[0] * 10.0**-DIGITS and alone.cost < most:
-            alone.step()
-        return alone.norms
 
 
 # -- the differences of entries ------------------------------------------------------------------------------

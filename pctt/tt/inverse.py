@@ -23,6 +23,7 @@ from pctt.tt.work import TooMuchWorkError, Work, inner_operations, local_operati
 
 IDLE = 0.8  # a sweep that leaves more than this part of the residual is the last, or, if ranks can grow, drops too much
 NOISE = 1e-7  # a smaller part of the residual counts as rounding
+PASSES = 8  # over the cores that must be left within the limit of operations, after ranks have grown
 CERTAIN = 0.7  # bound of ||I - S X||_F; below 1, because the estimate is sometimes wrong by a third
 INVERSION = "the inversion"  # the phase for `Work`
 EPSILON = float(np.finfo(float).eps)
@@ -274,14 +275,16 @@ def _solve(
                     X, left = _rounded(X, left, eps, measured)
                     return Inverse(X, False, left, count, growing.repaired)
                 enough *= 0.5 * eps / left  # the estimate sees only a part of the residual
+            # more passes have to make use of the ranks of the next one, with whose cubes the operations grow
+            room = (work.limit - work.spent) / (PASSES * max(work.spent - begun, 1.0))
+            ranks = [x.shape[3] for x in growing.x[:-1]]
+            growing.most = [int(max(r, min(r * max(room, 0.0) ** (1 / 3), cap))) for r, cap in zip(ranks, most)]
             if growing.estimate > IDLE * before:
-                if all(x.shape[3] >= r for x, r in zip(growing.x, most)):
+                if ranks == growing.most:
                     break
                 growing.drop *= 0.3
             before = growing.estimate
-            # in the next pass ranks are up to twice as large, and one more pass has to make use of them
-            if work.spent + 8 * (work.spent - begun) > work.limit:
-                growing.most = most = [x.shape[3] for x in growing.x[:-1]]
+            if growing.most != most:
                 stopped = growing.words(norm)
         except TooMuchWorkError:
             stopped = stopped or growing.words(norm)

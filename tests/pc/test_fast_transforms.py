@@ -86,7 +86,7 @@ def test_the_differences_are_those_of_the_entries(entries, even, block):
 @pytest.mark.parallel(1, 2, 3)
 @pytest.mark.parametrize(("entries", "even", "block"), [(covariance, True, 1), (oblique, False, 1), (pairs, False, 2)])
 def test_the_preconditioner_is_the_transform(entries, even, block, monkeypatch):
-    monkeypatch.setattr(of, "choose", promised(of.CANDIDATES[3], [1.0, 1e-8], [1.0]))
+    monkeypatch.setattr(of, "choose", promised(of.COSINE, [1.0, 1e-8], [1.0]))
     A = dense_of(entries, SIZE * block)
     ksp = ready(shell(entries, A, grid=GRID, block=block), rtol=1e-10)
     inverse = made(ksp).transform.inverse
@@ -137,7 +137,7 @@ def promised(kind: of.Kind, norms: list[float], alone: list[float]):
 def test_a_preconditioner_that_breaks_its_promise_is_left(method, norm, guess, monkeypatch):
     if method not in {"cg", "fcg"} and norm != ("preconditioned" if method == "minres" else "unpreconditioned"):
         pytest.skip("PETSc has no such method, or it takes the norm of another residual")
-    monkeypatch.setattr(of, "choose", promised(of.CANDIDATES[3], [1.0, 1e-1, 1e-8], [1.0, 1e-1, 1e-8]))
+    monkeypatch.setattr(of, "choose", promised(of.COSINE, [1.0, 1e-1, 1e-8], [1.0, 1e-1, 1e-8]))
     ksp = solver(from_differences(waves, (40, 40)), method, rtol=1e-8)
     ksp.setNormType(getattr(PETSc.KSP.NormType, norm.upper()))
     if method in {"gmres", "bcgs"} and norm == "unpreconditioned":
@@ -176,7 +176,7 @@ def test_one_that_keeps_its_promise_is_not_left():
 
 def test_the_promise_of_a_worse_method_is_kept_where_none_is_worse_still(monkeypatch):
     """Conjugate gradients alone are tried beside, and not taken, as they are slower."""
-    monkeypatch.setattr(of, "choose", promised(of.CANDIDATES[3], [1.0, 1e-8], [1.0, 1e-1, 1e-8]))
+    monkeypatch.setattr(of, "choose", promised(of.COSINE, [1.0, 1e-8], [1.0, 1e-1, 1e-8]))
     A = from_differences(lambda s: 0.01 * (s == 0).all(axis=0) + np.exp(-np.hypot(*s) / 12), (50, 50))
     ksp = ready(A, rtol=1e-8)
     iterations, left = solve(ksp)
