@@ -529,7 +529,8 @@ class Scene:
         """What is likely a mistake, in words: materials that nothing has, and moments of more than a radius; empty if
         there is nothing."""
         used = {int(number) for part in self.parts for number in np.unique(part.material)}
-        used |= {each.material for each in (*self.large_bodies, *self.passages.sources.values())}
+        used |= {body.material for body in self.large_bodies}
+        used |= {source.material for source in self.passages.sources.values()}
         here = {name for name, number in self._materials.items() if number in used}
         unused = [name for name in self.materials if name not in here]
         found = [f"no body has the material {name!r}{checks.nearest(name, here)}" for name in unused]
