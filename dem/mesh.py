@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from dem import stl
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.checks import between, check_fields, finite, not_negative, positive, rows, unit_quaternion, vector
 from dem.compiled import loop
+from dem.geometry import stl
 from dem.quaternion import cross, length
 
 

@@ -526,19 +526,18 @@ class Scene:
         return tuple(self._materials)
 
     def doubts(self) -> str:
-        """What is likely a mistake, in words: materials that nothing has, and moments of more than a radius; empty if
-        there is nothing."""
+        """What is likely a mistake, in words: materials that nothing has, and what laws doubt; empty if there is
+        nothing."""
         used = {int(number) for part in self.parts for number in np.unique(part.material)}
         used |= {body.material for body in self.large_bodies}
         used |= {source.material for source in self.passages.sources.values()}
         here = {name for name, number in self._materials.items() if number in used}
         unused = [name for name in self.materials if name not in here]
         found = [f"no body has the material {name!r}{checks.nearest(name, here)}" for name in unused]
-        most = max(max(law.rolling, law.spinning) for law in (self._law, *self._pairs.values()))
-        if self.count and most > (size := float(bodies.bounding_radius(self.survey().extremes).max())):
-            words = f"rolling or spinning of {most:g} m, a length, is more than the greatest radius, {size:g} m"
-            found.append(f"{words}: a coefficient times the radius?")
-        return "; ".join(found)
+        if self.count:
+            radius = float(bodies.bounding_radius(self.survey().extremes).max())
+            found += dict.fromkeys(law.doubt(radius) for law in (self._law, *self._pairs.values()))
+        return "; ".join(filter(None, found))
 
     def pairs(self, stiffness: float) -> ContactLaw:
         """The tables of all pairs of materials, with this `stiffness` [N/m] where none is stated."""

@@ -33,6 +33,9 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
         for law in LAWS:
             law.refuse(self)
 
+    def doubt(self, radius: float) -> str:
+        return "; ".join(filter(None, (law.doubt(self, radius) for law in LAWS)))
+
     @property
     def acting(self) -> list[type[Law]]:
         """The laws that add something."""

@@ -59,6 +59,10 @@ class Law:
     def refuse(self) -> None:
         """ValueError for coefficients that do not go together."""
 
+    def doubt(self, radius: float) -> str:
+        """What is likely a mistake among bodies of at most this radius [m], in words; empty if there is nothing."""
+        return ""
+
     def acts(self) -> bool:
         """Whether the law adds anything to contacts of any pair."""
         return False

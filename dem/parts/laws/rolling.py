@@ -19,6 +19,11 @@ class Rolling(Law):
     rolling: Any = coefficient(checks.not_negative, 0.0)  #: greatest moment against it, over the normal force [m]
     spinning: Any = coefficient(checks.not_negative, 0.0)  #: the same about the normal [m]
 
+    def doubt(self, radius: float) -> str:
+        most = max(self.rolling, self.spinning)
+        words = f"rolling or spinning of {most:g} m, a length, is more than the greatest radius, {radius:g} m"
+        return f"{words}: a coefficient times the radius?" if most > radius else ""
+
     def acts(self) -> bool:
         return bool(np.any(self.rolling) or np.any(self.spinning))
 
