@@ -23,9 +23,9 @@ def contacts_at_rest(world: World, system: ContactSystem, passing: Floats, slow:
 
     passing : (nc,) speeds of tools, belts and flows at the contacts [m/s]
 
-    Returns the contacts of this rank, ascending, and the greatest part of that energy that one of these islands has. A
+    Returns the contacts of this rank, ascending, and the greatest part of that energy that one of its islands has. A
     single sphere is no island, and a cell that deforms connects all bodies. Collective."""
-    nothing = np.zeros(0, np.intp), np.inf
+    nothing = np.zeros(0, np.intp), 0.0
     if system.cell is not None:
         return nothing
     near, contact_map = system.near, system.contact_map

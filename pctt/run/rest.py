@@ -22,7 +22,7 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Floats
 from dem.compiled import loop
-from dem.exchange import on_any, reduced
+from dem.exchange import reduced
 from dem.model.world import World
 from dem.record import energy
 from dem.step.islands import contacts_at_rest
@@ -62,7 +62,8 @@ def with_islands(
     if limits.aim < 1.0 or not found.converged:
         return found
     contacts, part = contacts_at_rest(world, system, _passing(system, _tools(world, system)), SLOW)
-    if not on_any(world.comm, len(contacts) > 0)[0]:
+    (count,), (part,) = reduced(world.comm, (len(contacts),), (part,))
+    if not count:
         return found
     limits, rows = _aimed(limits, world, part), problem.cones.rows_of(contacts)
     with problem.part(contacts) as alone:
