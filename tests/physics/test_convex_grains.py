@@ -93,7 +93,7 @@ def overlap(sim):
 
 def test_superellipsoids_rock_on_ends_of_cylinders_without_overlaps():
     """On nearly flat sides: the point that bears goes far within a step, as impacts change how they turn."""
-    rng, many = np.random.default_rng(4), 6
+    rng, many = np.random.default_rng(3), 6
     place, tilt, way = 0.3 * np.eye(3)[:1] * np.arange(many)[:, None], *rng.uniform(0.05, [0.15, 6.0], (many, 2)).T
     axis = np.stack([np.cos(way), np.sin(way), 0 * way], axis=1)
     scene = on_floor("plane", 0.4)
