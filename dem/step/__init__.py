@@ -24,7 +24,9 @@ from dem.step.system import ContactSystem, contact_arms, contact_frames, gap_vel
 from dem.together import meet
 from dem.unconstrained import UnconstrainedMotion, large_velocity
 
-ALIKE = 0.99  #: cosine between the normals of two linearisations of a contact of which the later one replaces the other
+#: Of two linearisations of a contact the later one replaces the other: cosine between their normals, at least, and way
+#: between their points over the overlap that is let pass, at most.
+ALIKE, NEAR = 0.99, 10.0
 
 
 @dataclass(frozen=True)
@@ -223,8 +225,8 @@ def find_turned(
     other points may meet. What overlaps at the end of the step is linearised there: with the normal n of the end, and
     the gap at the start that leads to the gap of the end with these velocities. This is a step of Newton's method (of
     sequential quadratic programming) for the gaps at the end of the step. Where it was `tried` in this time step, what
-    turns between two features would go to and fro for ever: a linearisation with another normal then stays, and the new
-    one is a contact beside it.
+    turns between two features, or rocks on a flat side, would go to and fro for ever: a linearisation with another
+    normal or point then stays, and the new one is a contact beside it.
     """
     dt = free.dt
     if not _turn(world, velocity[: len(world.grains)], dt, depth):
@@ -245,6 +247,7 @@ def find_turned(
     if tried and len(contacts):
         place = places(contacts.key, found.key)
         others = np.einsum("ci,ci->c", contacts.normal[place], found.normal) < ALIKE
+        others |= quaternion.length(contacts.point[place] - found.point) > NEAR * depth
         found = replace(found, key=np.where((place >= 0) & others, found.key + 0.5**tried * 1j, found.key))
     return _joined(world, contacts.take(places(found.key, contacts.key) < 0), found)
 

@@ -110,7 +110,7 @@ def test_bodies_overlap_by_no_more_than_they_do():
     assert min(linear) < -0.05
 
 
-def test_a_second_linearisation_of_another_direction_stands_beside_the_first():
+def test_a_second_linearisation_of_another_direction_or_point_stands_beside_the_first():
     """What turns between two features would be linearised to and fro, and overlap in the end."""
     sim = boxes_that_hit()
     sim.step()
@@ -126,6 +126,9 @@ def test_a_second_linearisation_of_another_direction_stands_beside_the_first():
         assert (len(again) > len(turned)) == stands
         assert len(set(again.key)) == len(again)
         assert len(find_turned(world, free, turned, velocity, depth, np.inf, 0)) == len(turned)
+    for way, stands in ((5.0, False), (20.0, True)):
+        moved = replace(first, point=first.point + way * depth * np.eye(3)[1])
+        assert (len(find_turned(world, free, moved, velocity, depth, np.inf, 1)) > len(first)) == stands
 
 
 def found_of(comm):
