@@ -26,7 +26,7 @@ from pctt.tt.train import Array
 from pctt.tt.work import ENTRY, MULTIPLY
 
 BLOCK = 64  # columns that are drawn at a time
-PROBE, LEAST, PART = 12, 3, 0.1  # steps of a trial, at most and at least, and the part of a solution that ends it
+PROBE, LEAST, PART = 12, 3, 0.15  # steps of a trial, at most and at least, and the part of a solution that ends it
 FEW = 20  # iterations that need no trial
 GAIN = 1.3  # of block Jacobi, in iterations, with which it is taken
 MANY = 1e5  # iterations that are as bad as none

@@ -25,7 +25,7 @@ class JointNow:
         self._sim, self.name, self._number = sim, name, number_of(sim.world, "joint", name)
 
     def __repr__(self) -> str:
-        joint = self._sim.world.joints[self.name]
+        joint = self._sim.world.named["joint"][self.name]
         one, other = ("the world" if end is None else repr(end) for end in joint.ends)
         return f"<Joint {self.name!r}: {joint.kind} of {one} and {other}>"
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import resource
 import sys
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -155,16 +154,15 @@ class Stepper:
         settings = self.settings
         with log.phase("solve"):
             limits = rest.limits_of(settings.limits, world, system)
-            solve = partial(self._by, None)
-            result = self._by(self.newton, problem, guess, limits)
+            result = self._by(problem, guess, limits)
             rest.account(world, limits, result)
-            result = rest.with_islands(world, system, problem, guess, limits, solve, result)
+            result = rest.with_islands(world, system, problem, guess, limits, self._by, result)
         return result if before is None else result.after(before)
 
-    def _by(self, newton: ccp.Newton | None, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits) -> ccp.Result:
+    def _by(self, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits) -> ccp.Result:
         """What the method of the settings makes of a problem."""
         settings = self.settings
-        return ccp.solve(problem, guess, settings.solver, limits, settings.options, newton, settings.law)
+        return ccp.solve(problem, guess, settings.solver, limits, settings.options, self.newton, settings.law)
 
     def _missed(
         self, world: World, system: ContactSystem, velocity: Array, turned: int

@@ -210,7 +210,7 @@ def test_the_wheel_and_its_bed():
     assert np.linalg.norm(np.array(wheel.shapes[0].half_extents)[[0, 2]]) == pytest.approx(scene.wheel_radius)
     assert built.grains().position[:, 2].max() + scene.radius < wheel.position[2] - scene.wheel_radius
     pushed = replace(scene, free=True, drawbar=0.1).build()
-    assert pushed.loads["drawbar"].force[0] == pytest.approx(-0.1 * scene.mass * G)
+    assert pushed.named["load"]["drawbar"].force[0] == pytest.approx(-0.1 * scene.mass * G)
     assert pushed.large_bodies[2].motion.velocity[0] is None
     assert wheel.motion.velocity[0] == pytest.approx(scene.spin * scene.wheel_radius * 0.7)
 

@@ -156,7 +156,7 @@ def test_parts_of_an_equation_of_the_second_kind_do_not_show_all_of_it(strength)
 
 def test_the_best_share_is_chosen() -> None:
     t = 2 - 2 * np.cos(2 * np.pi * np.arange(512) / 512)
-    fractional = np.fft.irfft2((t[:, None] + t[:257]) ** 0.7)[:48, :48]
+    fractional = np.fft.irfft2((t[:, None] + t[:257]) ** 0.7)[:160, :160]
     a = of.Differences.of_even(fractional)
     assert count(a, of.choose(a).kind) <= 1.25 * min(count(a, kind) for kind in of.EVEN if kind)
 
