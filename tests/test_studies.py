@@ -62,8 +62,8 @@ SMALL = [
     "validate closed_forms", "seeds 1,2 -scene plane_shear -seconds 0.02", "h_stop 2 --rate 40",
     "features loads --steps 1 --rounds 1", "shapes -n 3 -steps 5 -shapes spheres,cubes",
     "torture plant cell -n 2 -kills 3 -steps 20", "structure run", "sparse -names pbjacobi",
-    "random_scenes 0 3 --steps 3 --processes 1", "drawn_kernels 0 2", "ranks functions", "kernels -only imq1 -ways auto plain",
-    "table_plots", "pictures incline -n 2",
+    "random_scenes 0 3 --steps 3 --processes 1", "drawn_kernels 0 2", "ranks functions",
+    "kernels -only imq1 -ways auto plain", "table_plots", "pictures incline -n 2",
 ]  # fmt: skip
 ELSEWHERE = {"compare_chrono", "compare_liggghts", "convert_problems"}
 DRAWS = {"structure": "matplotlib", "table_plots": "matplotlib", "pictures": "vtkmodules"}  # and nothing else

@@ -136,8 +136,8 @@ def beside(guest, **law):
 @pytest.mark.parametrize(
     ("guest", "law"),
     [
-        ("roller", {}), ("roller", {"rolling": 0.002}), ("roller", {"restitution": 0.5}), ("mixed bed", {}),
-        ("pendulum", {}),
+        ("roller", {}), ("roller", {"rolling": 0.002}), ("roller", {"restitution": 0.5}), ("pendulum", {}),
+        pytest.param("mixed bed", {}, marks=pytest.mark.slow),
     ],
 )
 def test_a_column_is_at_rest_whatever_moves_beside_it(guest, law):

@@ -87,6 +87,7 @@ def test_a_ball_rolls_as_far_as_static_friction_holds_it():
         assert rate == pytest.approx(exact, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_block_at_a_spring_sticks_and_slips():
     k, speed, dt = 100.0 * MASS, 0.05, 0.002
     high, low = STICKS * MASS * G / k, SLIDES * MASS * G / k
