@@ -67,7 +67,9 @@ def pairs_in_cells(center: Floats, radius: Floats, first: Ints, second: Ints, al
         )
         if done == len(rows):
             return pairs[:found].copy()
-        pairs = np.concatenate((pairs, np.empty((max(len(pairs), len(second)), 2), np.int64)))
+        more = np.empty((len(pairs) + max(len(pairs), len(second)), 2), np.int64)
+        more[:found] = pairs[:found]
+        pairs = more
 
 
 @loop

@@ -296,17 +296,18 @@ def delassus(comm: MPI.Comm, G: BlockRows) -> PETSc.Mat:
 
 def all_blocks(G: BlockRows) -> sp.bsr_matrix:
     """N = G G' of a problem on one rank, dense columns included."""
-    indptr, indices, blocks = _all_blocks(G.indptr, G.indices, np.ascontiguousarray(G.blocks), G.columns)
+    starts = np.cumsum(np.bincount(G.indices + 1, minlength=G.columns + 1))
+    indptr, indices, blocks = _all_blocks(G.indptr, G.indices, np.ascontiguousarray(G.blocks), starts)
+    indices, blocks = indices[: indptr[-1]].copy(), blocks[: indptr[-1]].copy()
     return sp.bsr_matrix((blocks, indices, indptr), shape=(3 * G.rows,) * 2)
 
 
 @loop
-def _all_blocks(indptr, indices, blocks, columns):
-    count, start = len(indptr) - 1, np.zeros(columns + 1, np.int64)
-    for body in indices:
-        start[body + 1] += 1
-    start = np.cumsum(start)
-    end, contact, place = start[:-1].copy(), np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)
+def _all_blocks(indptr, indices, blocks, start):
+    """`start` (columns + 1,): of the blocks of each column, were they in the order of columns. Returns as many rows of
+    the last two as are needed, and more."""
+    count, columns, end = len(indptr) - 1, len(start) - 1, start.copy()
+    contact, place = np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)
     for c in range(count):
         for p in range(indptr[c], indptr[c + 1]):
             k = end[indices[p]]
@@ -331,7 +332,7 @@ def _all_blocks(indptr, indices, blocks, columns):
                         for m in range(6):
                             out[where[other], i, j] += blocks[p, i, m] * blocks[q, j, m]
         starts[c + 1] = last
-    return starts, near[:last].copy(), out[:last].copy()
+    return starts, near, out
 
 
 @loop

@@ -56,8 +56,8 @@ def active(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDArra
 
 
 @loop
-def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float, units: Array) -> tuple[Array, float]:
-    """Sums (5,) over the contacts, and the greatest -y_n, or 0. The sums are of |P(x - step y) - x|^2, where y gets the
+def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float, units: Array) -> tuple[Array, Array]:
+    """Sums (5, STRIP) over some of the contacts each, and the greatest -y_n (STRIP,) of these, or 0. The sums are of |P(x - step y) - x|^2, where y gets the
     term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1, and below the rounding of step y it is zero: a contact that
     slides has 0 = P(-step y) only up to that; of |x|^2; and closing work, opening work and 1/2 x.(y - r).
 
@@ -75,7 +75,7 @@ def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float
             g[: b - a], v[: b - a] = x[a:b], y[a:b]
         _add_moves(g, v, step, friction, de_saxce, sums[0])
         _add_works(g, v, r[a:b], len(friction), sums[1], sums[2], sums[3], sums[4], most)
-    return sums.sum(axis=1), most.max()
+    return sums, most
 
 
 @loop
@@ -115,45 +115,37 @@ def _add_works(x, y, r, count, squares, closings, openings, energies, most):
 def accelerated_step(
     x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, de_saxce: float,
     out: Array,
-) -> tuple[float, float, float]:  # fmt: skip
+) -> Array:  # fmt: skip
     """P(z - step y_z) for z = x + beta (x - last_x) and its gradient y_z = y + C z, to which the term (mu |y_t|, 0, 0)
     of De Saxce is added once (``de_saxce`` 1: Coulomb's law) or not (0). ``compliance`` has the diagonal of C (nc, 3),
     or no row for C = 0.
 
-    Returned are, for this rank, d'Cd and |d|^2 of d = out - z, and y_z'(out - x); z and y_z are nowhere stored. A
-    contact moves 64 bytes in single precision, 52 without compliance."""
-    part, way, soft = x.dtype.type(beta), x.dtype.type(step), len(compliance) > 0
-    sums = np.zeros(((len(mu) + PART - 1) // PART, 3))
-    for k in prange(len(sums)):
-        a, b = k * PART, min(k * PART + PART, len(mu))
-        stiff = compliance[a:b] if soft else compliance
-        sums[k] = _step_of_part(x[a:b], last_x[a:b], y[a:b], stiff, part, way, mu[a:b], de_saxce, out[a:b])
-    return sums[:, 0].sum(), sums[:, 1].sum(), sums[:, 2].sum()
-
-
-@loop
-def _step_of_part(x, last_x, y, compliance, part, way, mu, de_saxce, out):
-    soft = len(compliance) > 0
+    Returned are, for each part of the contacts of this rank (parts, 3), d'Cd and |d|^2 of d = out - z, and
+    y_z'(out - x); z and y_z are nowhere stored. A contact moves 64 bytes in single precision, 52 without compliance."""
+    part, way, soft, count = x.dtype.type(beta), x.dtype.type(step), len(compliance) > 0, len(mu)
     x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
-    z, y_z = np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype)
-    squares, products = np.zeros(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
-    work = np.zeros(3 * STRIP, x.dtype)
-    for first in range(0, len(mu), STRIP):
-        friction = mu[first : first + STRIP]
-        a, b = 3 * first, 3 * (first + len(friction))
-        extrapolate(x[a:b], last_x[a:b], part, z)
-        if soft:
-            add_compliance(y[a:b], compliance[a:b], z, y_z)
-        else:
-            y_z[: b - a] = y[a:b]
-        if de_saxce:
-            _add_de_saxce(y_z, friction)
-        _step(z, y_z, way, friction, to[a:b])
-        add_squares(to[a:b], z, squares)
-        add_products(to[a:b], x[a:b], y_z, products)
-        if soft:
-            add_work(to[a:b], z, compliance[a:b], work)
-    return work.sum(), squares.sum(), products.sum()
+    sums = np.zeros(((count + PART - 1) // PART, 3))
+    for k in prange(len(sums)):
+        z, y_z = np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype)
+        squares, products = np.zeros(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
+        work = np.zeros(3 * STRIP, x.dtype)
+        for first in range(k * PART, min(k * PART + PART, count), STRIP):
+            friction = mu[first : first + STRIP]
+            a, b = 3 * first, 3 * (first + len(friction))
+            extrapolate(x[a:b], last_x[a:b], part, z)
+            if soft:
+                add_compliance(y[a:b], compliance[a:b], z, y_z)
+            else:
+                y_z[: b - a] = y[a:b]
+            if de_saxce:
+                _add_de_saxce(y_z, friction)
+            _step(z, y_z, way, friction, to[a:b])
+            add_squares(to[a:b], z, squares)
+            add_products(to[a:b], x[a:b], y_z, products)
+            if soft:
+                add_work(to[a:b], z, compliance[a:b], work)
+        sums[k] = work.sum(), squares.sum(), products.sum()
+    return sums
 
 
 @loop
@@ -297,12 +289,16 @@ class FrictionCones(Cones):
     def accelerated_step(
         self, x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, coulomb: bool, out: Array
     ) -> tuple[float, float, float]:
-        return accelerated_step(x, last_x, y, compliance, beta, step, self.mu, float(coulomb), out)
+        sums = accelerated_step(x, last_x, y, compliance, beta, step, self.mu, float(coulomb), out)
+        work, square, product = sums.sum(axis=0)
+        return work, square, product
 
     def errors(
         self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None
     ) -> tuple[Array, float]:
-        return errors(g, y, r, step, self.mu, float(coulomb), np.empty((0, *r.shape)) if units is None else units)
+        units = np.empty((0, *r.shape)) if units is None else units
+        sums, most = errors(g, y, r, step, self.mu, float(coulomb), units)
+        return sums.sum(axis=1), float(most.max())
 
     def active(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
         return active(x, last_x, y, self.mu, least)

@@ -62,8 +62,9 @@ class Factors:
         #: lower blocks, and the transposes of the upper ones; the diagonal is in the first
         self._lower = np.zeros((order.head + len(order.rows) + order.rest**2, 3, 3))
         self._upper = self._lower if symmetric else np.zeros_like(self._lower)
-        given = order.head, order.number, order.starts, order.rows, order.target
-        _factorised(N.indptr, N.indices, N.data, diagonal, *given, self._lower, self._upper, symmetric)
+        given = order.head, order.number, order.starts, order.rows
+        _place(N.indptr, N.indices, N.data, diagonal, *given, self._lower, self._upper)
+        _eliminate(order.head, order.starts, order.target, self._lower, self._upper, symmetric)
         if order.rest:
             self._factorise_rest(symmetric)
 
@@ -128,7 +129,9 @@ def _ordered(indptr, indices, full, least, most):
         if pairs > most:
             return -1, number, starts, rows, near
         while begin + found > len(rows):
-            rows = np.concatenate((rows, np.empty(len(rows), np.int64)))
+            more = np.empty(2 * len(rows), np.int64)
+            more[: len(rows)] = rows
+            rows = more
         for a in range(found):
             i = near[a]
             degree[i] -= 1
@@ -151,8 +154,11 @@ def _ordered(indptr, indices, full, least, most):
     for k in range(head):
         column = rows[starts[k] : starts[k + 1]]
         for a in range(len(column)):
-            column[a] = number[column[a]]
-        column.sort()
+            row, b = number[column[a]], a
+            while b > 0 and column[b - 1] > row:  # columns are short, and numba's sort takes a second to compile
+                column[b] = column[b - 1]
+                b -= 1
+            column[b] = row
         for a in range(len(column)):
             place[order[column[a]], order[k]] = 1 + starts[k] + a
     for k in range(head):
@@ -167,14 +173,6 @@ def _ordered(indptr, indices, full, least, most):
                     target[p] = head + place[order[i], order[j]] - 1
                 p += 1
     return head, number, starts[: head + 1], rows[: starts[head]], target
-
-
-@loop
-def _factorised(
-    indptr, indices, blocks, diagonal, head, number, starts, rows, target, lower, upper, symmetric
-):  # fmt: skip
-    _place(indptr, indices, blocks, diagonal, head, number, starts, rows, lower, upper)
-    _eliminate(head, starts, target, lower, upper, symmetric)
 
 
 @loop
