@@ -27,7 +27,7 @@ there then goes with the host (`seen_from`, `turn_ahead`).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,9 @@ from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPH
 from dem.compiled import inlined, loop
 from dem.contact.spheres import frame_of, to_box
 from dem.geometry.vectors import cross, dot, plus, shares, turned
+
+if TYPE_CHECKING:
+    from dem.contact.narrow import Touch
 
 #: Radii (half thicknesses) by which a body is moved ahead along another one, at most: its impulses may stop it sooner.
 FURTHEST = 0.25
@@ -46,6 +49,18 @@ DEEP = 0.005
 #: Of spheres, boxes, -, capsules, half spaces, meshes, polyhedra, other convex bodies: of a pair the one of lower rank
 #: is the guest.
 RANK = np.array([0, 3, 9, 1, 5, 6, 4, 2])
+
+
+class Placed(NamedTuple):
+    """The shapes of `dem.contact.primitives.Primitives`, as loops take them."""
+
+    kind: Ints  #: (n,)
+    row: Ints  #: (n,) of the body
+    center: Floats  #: (n, 3) [m]
+    quaternion: Floats  #: (n, 4)
+    size: Floats  #: (n, 3) [m]
+    radius: Floats  #: (n,) [m]
+    inner: Floats  #: that of `dem.contact.polyhedra.Hulls`
 
 
 class Course(NamedTuple):
@@ -72,18 +87,17 @@ def guest_is_second(one, two):
 
 
 @loop
-def seen_from(
-    kind: Ints, row: Ints, center: Floats, quaternion: Floats, size: Floats, radius: Floats, inner: Floats,
-    place: Floats, velocity: Floats, moves: Bools, dt: float, i: Ints, j: Ints,
-) -> tuple[Floats, Floats, Floats]:  # fmt: skip
-    """Centres (m, 3) and quaternions (m, 4) of guests, the rows i (m,) of `Primitives`, at the end of a step, as seen
+def seen_from(shapes: Placed, course: Course, i: Ints, j: Ints) -> tuple[Floats, Floats, Floats]:
+    """Centres (m, 3) and quaternions (m, 4) of guests, the rows i (m,) of the shapes, at the end of a step, as seen
     from the bodies of their hosts, the rows j (m,), put back to where these are now; and how far the surfaces of the
-    two go along each other until then (m,), at most. `inner` is that of `Hulls`."""
+    two go along each other until then (m,), at most."""
+    place, velocity, _, dt = course
+    row, center, quaternion = shapes.row, shapes.center, shapes.quaternion
     middle, turn, way = np.empty((len(i), 3)), np.empty((len(i), 4)), np.empty(len(i))
     for p in range(len(i)):
         a, b = i[p], j[p]
         A, B = row[a], row[b]
-        h, speed = ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
+        h, speed = ahead_by(a, b, shapes, course)
         u, w, way[p] = vector_of(velocity[A], 3), vector_of(velocity[B], 3), h * speed
         far = plus(vector_of(place[A], 0), h, vector_of(velocity[A], 0))
         far = plus(far, 1.0, after_turn(plus(center[a], -1.0, place[A]), u, h))
@@ -98,21 +112,19 @@ def seen_from(
 
 @loop
 def turn_ahead(
-    kind: Ints, row: Ints, center: Floats, quaternion: Floats, size: Floats, radius: Floats, inner: Floats,
-    place: Floats, velocity: Floats, moves: Bools, dt: float, i: Ints, j: Ints, pair: Ints, point: Floats,
-    normal: Floats, gap: Floats, arcs: Floats,
-) -> tuple[Floats, Floats, Floats, Ints]:  # fmt: skip
-    """Give contacts (nc,) of the pairs of rows i, j (m,) of `Primitives` the normals of the end of a step of dt [s] and
-    the places of its start, of bodies of prescribed motion those of its end: `point` is as seen from the present place
-    of body i. Returns (nc, 3) from body j to where it is relative to i for that [m]; by how much (nc, 3) the mean
+    shapes: Placed, course: Course, i: Ints, j: Ints, pair: Ints, touch: Touch, arcs: Floats
+) -> tuple[Floats, Floats, Floats, Ints]:
+    """Give contacts (nc,) of the pairs of rows i, j (m,) of the shapes the normals of the end of a step and the places
+    of its start, of bodies of prescribed motion those of its end: `point` is as seen from the present place of body i.
+    Returns (nc, 3) from body j to where it is relative to i for that [m]; by how much (nc, 3) the mean
     velocities of surfaces along each other, of j relative to i, differ from those with these arms [m/s]; and the gaps
     (nc,) from which gaps that are linear in the velocities lead to those of the end [m]. Contacts of guests in the
     places of `seen_from` get these as their `gap`; returns also which of them overlap by more than DEEP so.
 
-    The bodies in the rows of `Primitives.row` are at `place` (rows, 3) and move with `velocity` (rows, 6); those that
-    impulses move are in `moves` (rows,). `arcs` (nc, 4, 3), as of `dem.contact.convex.arcs_of`; empty without such
-    shapes.
-    """
+    `arcs` (nc, 4, 3) are as of `dem.contact.convex.arcs_of`; empty without such shapes."""
+    kind, row, center, quaternion, size, _, inner = shapes
+    place, velocity, moves, dt = course
+    point, normal, gap = touch
     moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
     deep, found = np.empty(len(pair), np.int64), 0
     for c in range(len(pair)):
@@ -122,7 +134,7 @@ def turn_ahead(
         A, B, sign = row[a], row[b], -1.0 if swap else 1.0
         V, u = vector_of(velocity[A], 0), vector_of(velocity[A], 3)
         W, w = vector_of(velocity[B], 0), vector_of(velocity[B], 3)
-        h, _ = ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
+        h, _ = ahead_by(a, b, shapes, course)
         here = kind[a] == SPHERE and kind[b] in (SPHERE, PLANE, BOX)
         core = size[a, 0] if kind[a] in (SPHERE, CAPSULE) else 0.0  # its surface turns with the normal, not with a body
         under = size[b, 0] if kind[b] in (SPHERE, CAPSULE) else 0.0
@@ -209,9 +221,11 @@ def _from_host(end, kind, quaternion, size, radius, spin, time):
 
 
 @inlined
-def ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt):
+def ahead_by(a, b, shapes, course):
     """The time by which a pair of a guest a and a host b is foreseen: dt, or less where the surface of the one goes
     further along the other than FURTHEST allows; and the speed at which it goes."""
+    kind, row, center, quaternion, size, radius, inner = shapes
+    place, velocity, _, dt = course
     least, other = _thickness(kind[a], size[a], inner), _thickness(kind[b], size[b], inner)
     if other < np.inf and kind[a] in (SPHERE, CAPSULE) and kind[b] not in (SPHERE, CAPSULE):
         other = radius[b]  # a plate may be thinner than the way: centre or core do not get into it

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from dem import bodies, quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, MESH, PLANE
 from dem.compiled import loop
+from dem.contact.ahead import Placed
 from dem.contact.lists import Lists, Rows
 from dem.contact.primitives import Primitives
 from dem.model.neighbourhood import Neighbourhood
@@ -16,6 +19,32 @@ from dem.quaternion import cross, length
 
 #: Rows i, j (m,) of `Primitives`, of which i has the lower number, and the gaps (m,) within which their margins meet.
 Pairs = tuple[Ints, Ints, Floats]
+
+
+class Grains(NamedTuple):
+    """Grains and the pairs of a `Rows`."""
+
+    start: Ints  #: (grains + 1,)
+    other: Ints  #: (start[-1],)
+    margin: Floats  #: (grains + ghosts,) [m]
+    grown: Bools  #: (grains + ghosts,) which of them have pairs that count
+
+
+class Parts(NamedTuple):
+    """Parts of large bodies."""
+
+    row: Ints  #: (p,) of `Primitives`
+    body: Ints  #: (p,)
+    turn: Floats  #: (p, 9) frames
+
+
+class Ways(NamedTuple):
+    """How large bodies go on."""
+
+    pivot: Floats  #: (bodies, 3) [m]
+    shifts: Floats  #: (k, bodies, 6) by which they may move and turn [m, rad]
+    turning: Bools  #: (bodies,) which of them have surfaces that go further than their
+    least: Floats  #: (bodies,) margins [m]
 
 
 def meeting(
@@ -66,32 +95,31 @@ def _of_grains(
     part = first + np.flatnonzero(wanted)
     turn = quaternion.matrix(table.quaternion[part]).reshape(-1, 9)
     turning, way = shifts[:, :, 3:].any(axis=(0, 2)), length(shifts[:, :, :3]).max(axis=0)
-    grains = rows.start, rows.other, near.margin, grown
-    large = near.bodies.position[first:], shifts, turning, np.maximum(0.5 * delta, np.where(turning, 0.0, way))
-    parts = part, table.row[part] - first, turn
-    shapes = table.number, table.kind, table.center, table.size, table.radius
+    grains, parts = Grains(rows.start, rows.other, near.margin, grown), Parts(part, table.row[part] - first, turn)
+    least = np.maximum(0.5 * delta, np.where(turning, 0.0, way))
+    given = grains, parts, Ways(near.bodies.position[first:], shifts, turning, least), table.placed(), table.number
     done, found, room = 0, 0, len(rows.other) + near.grains + len(part)
-    i, j, reach = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
+    out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
     while True:
-        done, found = fill(*grains, *parts, *large, *shapes, done, found, i, j, reach)
+        done, found = fill(*given, done, found, out)
         if done == near.grains:
+            i, j, reach = out
             return i[:found], j[:found], reach[:found]
-        i, j, reach = (np.concatenate([column, np.empty_like(column)]) for column in (i, j, reach))
+        i, j, reach = (np.concatenate([column, np.empty_like(column)]) for column in out)
+        out = i, j, reach
 
 
 @loop
 def fill(
-    start, other, margin, grown, part, body, turn, pivot, shifts, turning, least, number, kind, center, size, radius,
-    done, found, i, j, reach,
-):  # fmt: skip
-    """Add to the first pairs those of the rows that are not done, as long as there is room; new numbers of rows done
-    and pairs found.
-
-    The grains have the pairs `start`, `other`, of which those count where a grain has `grown`, and a `margin` each. The
-    parts are rows `part` (p,) with frames `turn` (p, 9), of the bodies `body` (p,). These have a `pivot` (bodies, 3),
-    move and turn by the `shifts` (k, bodies, 6), and have the margins `least` (bodies,) but for those `turning`
-    (bodies,), whose surfaces go further.
-    """
+    grains: Grains, parts: Parts, ways: Ways, shapes: Placed, number: Ints, done: int, found: int, out: Pairs
+) -> tuple[int, int]:
+    """Add to the first pairs of `out` those of the grains that are not done, as long as there is room; new numbers of
+    grains done and pairs found."""
+    start, other, margin, grown = grains
+    part, body, turn = parts
+    pivot, shifts, turning, least = ways
+    kind, center, size, radius = shapes.kind, shapes.center, shapes.size, shapes.radius
+    i, j, reach = out
     for n in range(done, len(start) - 1):
         if found + start[n + 1] - start[n] + len(part) > len(i):
             return n, found

@@ -21,8 +21,8 @@ import numpy as np
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, half_thickness
 from dem.compiled import inlined, loop
-from dem.contact.ahead import after_turn, ahead_by, guest_is_second, spun, vector_of
-from dem.contact.narrow import DISTINCT, Manifold, Planes
+from dem.contact.ahead import Course, Placed, after_turn, ahead_by, guest_is_second, spun, vector_of
+from dem.contact.narrow import DISTINCT, Manifold, Planes, Touch
 from dem.contact.polyhedra import CLOSE, ROUND, SNAP, Hulls, manifold_of, nearer
 from dem.contact.spheres import frame_of
 from dem.geometry.vectors import dot, plus
@@ -527,14 +527,16 @@ def _planes(body, hulls, outward, origin, delta, pair, feature, out):
 
 @loop
 def arcs_of(
-    kind: Ints, row: Ints, center: Floats, quaternion: Floats, size: Floats, radius: Floats, inner: Floats,
-    place: Floats, velocity: Floats, moves: Any, dt: float, i: Ints, j: Ints, pair: Ints, point: Floats,
-    normal: Floats, gap: Floats, what: Ints, numbers: Floats, radii: Floats,
-) -> Floats:  # fmt: skip
+    shapes: Placed, course: Course, i: Ints, j: Ints, pair: Ints, touch: Touch, supports: Supports
+) -> Floats:
     """Of contacts (nc,) as of `dem.contact.ahead.turn_ahead`, vectors (nc, 4, 3) from what turns with the bodies to
     their surfaces where these have the foreseen normal [m]: of guests at the end of the step and at its start, of hosts
     at these two. As a surface rolls on, the contact stays where its normal is. Zeros of points that go with the body,
-    and of shapes of other kinds. `what`, `numbers`, `radii` are columns of `Supports`."""
+    and of shapes of other kinds."""
+    kind, row, center, quaternion, size, _, _ = shapes
+    place, velocity, _, _ = course
+    point, normal, gap = touch
+    what, numbers, radii, _ = supports
     arcs = np.zeros((len(pair), 4, 3))
     for c in range(len(pair)):
         one, two = i[pair[c]], j[pair[c]]
@@ -544,7 +546,7 @@ def arcs_of(
             continue
         A, B, sign = row[a], row[b], -1.0 if swap else 1.0
         u, w = vector_of(velocity[A], 3), vector_of(velocity[B], 3)
-        h, _ = ahead_by(a, b, kind, row, center, quaternion, size, radius, inner, place, velocity, dt)
+        h, _ = ahead_by(a, b, shapes, course)
         n = after_turn((sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]), w, h)
         middle = after_turn(plus(point[c], -1.0, place[B]), w, h)
         apart = plus(place[A], -1.0, place[B])

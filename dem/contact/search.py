@@ -121,8 +121,8 @@ def find_contacts(
     table, i, j, reach = table.of_members(*pairs)
     found, ahead = _narrow(world, near, images, table, (i, j, reach), free)
     key, a, b, body, friction, owned = named(
-        *(table.number, table.row, table.kind, near.index, near.bodies.material, world.pairs.friction),
-        *(table.hulls.features, near.grains, i, j, found.pair, found.feature),
+        *(table.placed(), table.number, near.index, near.bodies.material, world.pairs.friction),
+        *(table.hulls.features, near.grains, (i, j), (found.pair, found.feature)),
     )
     contacts = Contacts(key, a, b, body, *found.touch, friction, near, shifts, owned, lists, **ahead)
     if world.cell.periodic:
@@ -231,12 +231,14 @@ def _grown(near: Neighbourhood, shifts: Floats, besides: Contacts | None) -> Boo
 
 
 @loop
-def named(number, row, kind, index, material, friction, features, grains, i, j, pair, feature):
-    """Of contacts of the pairs of rows i, j (m,) of `Primitives`, with their number `pair` (nc,) and `feature` (nc,):
+def named(shapes, number, index, material, friction, features, grains, pairs, contacts):
+    """Of contacts, with the numbers (nc,) of their `pairs`, rows i, j (m,) of the shapes, and their features (nc,):
     key, rows a and b of the bodies, `index` of the bodies (nc, 2), friction; and how many each of the `grains` owns.
 
     Keys are distinct, and the same at all times: the number of the one, and that of the other with the feature. A mesh
     takes further numbers for its features."""
+    kind, row = shapes.kind, shapes.row
+    (i, j), (pair, feature) = pairs, contacts
     key, a, b = np.empty(len(pair), np.complex128), np.empty(len(pair), np.int64), np.empty(len(pair), np.int64)
     body, mu, owned = np.empty((len(pair), 2), np.int64), np.empty(len(pair)), np.zeros(grains)
     for c in range(len(pair)):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,27 @@ ROUNDING = 1e-9
 SHORT = 25.0
 
 
+class Touching(NamedTuple):
+    """Columns of `Contacts`."""
+
+    one: Ints  #: (nc,) rows of the first bodies
+    two: Ints  #: (nc,) of the second ones
+    normal: Floats  #: (nc, 3)
+    gap: Floats  #: (nc,) [m]
+    linear: Floats  #: (nc,) [m]
+
+
+class Spheres(NamedTuple):
+    """Bodies, of which some are spheres."""
+
+    ball: Bools  #: (rows,) which
+    mass: Floats  #: (rows,) [kg]
+    radius: Floats  #: (rows,) [m]
+    material: Ints  #: (rows,)
+    place: Floats  #: (rows, 3) [m]
+    velocity: Floats  #: (rows, 6) before the step, of prescribed motions that of the step
+
+
 def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> Contacts:
     """The contacts of a step, of this motion without contacts, with what impacts that are followed change of them;
     collective.
@@ -65,9 +86,10 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         old[grains:] = motion.prescribed
     image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     slow, radius = dt * math.hypot(*world.gravity), np.ascontiguousarray(table.size[:, 0])
+    touching = Touching(contacts.a, contacts.b, contacts.normal, contacts.gap, contacts.linear_gap)
+    spheres = Spheres(ball, table.mass, radius, table.material, table.position, old)
     kind, bounce, offset, marked = struck(
-        contacts.a, contacts.b, contacts.normal, contacts.gap, contacts.linear_gap, ball, table.mass, radius,
-        table.material, pairs.restitution, pairs.stiffness, grains, table.position, old, image, dt, slow,
+        touching, spheres, pairs.restitution, pairs.stiffness, grains, image, dt, slow
     )  # fmt: skip
     if not on_any(world.comm, bool(marked.any()))[0]:
         return contacts
@@ -147,14 +169,15 @@ def _reached(world: World, contacts: Contacts, pairs: Ints, marked: Bools) -> Bo
 
 @loop
 def struck(
-    one: Ints, two: Ints, normal: Floats, gap: Floats, linear: Floats, ball: Bools, mass: Floats, radius: Floats,
-    material: Ints, restitution: Floats, stiffness: Floats, grains: int, place: Floats, velocity: Floats,
-    image: Floats, dt: float, slow: float,
+    contacts: Touching, spheres: Spheres, restitution: Floats, stiffness: Floats, grains: int, image: Floats, dt: float,
+    slow: float,
 ) -> tuple[Ints, Floats, Floats, Bools]:  # fmt: skip
-    """Of contacts (nc,) of bodies in the rows `one` and `two` the kinds (nc,), the coefficients of restitution (nc,)
+    """Of contacts (nc,) the kinds (nc,), the coefficients of restitution (nc,)
     and the ways from the second bodies to their images (nc, 3), of spheres `image`; and which bodies (rows,) meet by
     the velocities before the step, or pass each other while the linear gap closes. Those that press others that they
     touch are left out."""
+    one, two, normal, gap, linear = contacts
+    ball, mass, radius, material, place, velocity = spheres
     count = len(one)
     kind, bounce, offset = np.full(count, OTHER), np.empty(count), np.zeros((count, 3))
     meets, passes, marked = np.zeros(count, np.bool_), np.zeros(count, np.bool_), np.zeros(len(place), np.bool_)

@@ -57,9 +57,11 @@ def active(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDArra
 
 @loop
 def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float, units: Array) -> tuple[Array, Array]:
-    """Sums (5, STRIP) over some of the contacts each, and the greatest -y_n (STRIP,) of these, or 0. The sums are of |P(x - step y) - x|^2, where y gets the
-    term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1, and below the rounding of step y it is zero: a contact that
-    slides has 0 = P(-step y) only up to that; of |x|^2; and closing work, opening work and 1/2 x.(y - r).
+    """Sums (5, STRIP) over some of the contacts each, and the greatest -y_n (STRIP,) of these, or 0.
+
+    The sums are of |P(x - step y) - x|^2, where y gets the term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1, and
+    below the rounding of step y it is zero: a contact that slides has 0 = P(-step y) only up to that; of |x|^2; and
+    closing work, opening work and 1/2 x.(y - r).
 
     ``units`` (2, nc, 3) multiply x and y, if there are any: (0, nc, 3) is none."""
     sums, most = np.zeros((5, STRIP)), np.zeros(STRIP)
