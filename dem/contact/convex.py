@@ -23,7 +23,7 @@ from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, half_thickness
 from dem.compiled import inlined, loop
 from dem.contact.ahead import Course, Placed, after_turn, ahead_by, guest_is_second, spun, vector_of
 from dem.contact.narrow import DISTINCT, Manifold, Planes, Touch
-from dem.contact.polyhedra import CLOSE, ROUND, SNAP, Hulls, manifold_of, nearer
+from dem.contact.polyhedra import CLOSE, ROUND, SNAP, Found, Hulls, nearer
 from dem.contact.spheres import frame_of
 from dem.geometry.vectors import dot, plus
 from dem.shapes import CONVEX_SHAPES
@@ -105,21 +105,18 @@ def solids(kind: Ints, center: Floats, turn: Floats, size: Floats, hulls: Hulls,
 def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) -> Manifold:
     """Contacts of gap at most `delta` (m,) [m], all with the same normal."""
     done, found, room = 0, 0, 4 * len(delta) + POINTS
-    pair, feature, out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7))
+    contacts = Found.of(room)
     while True:
-        done, found = _pairs(first, second, hulls, delta, done, found, pair, feature, out)
+        done, found = _pairs(first, second, hulls, delta, done, found, contacts)
         if done == len(delta):
-            return manifold_of(pair[:found], feature[:found], out[:found])
-        pair, feature, out = (np.concatenate([column, np.empty_like(column)]) for column in (pair, feature, out))
+            return contacts.manifold(found)
+        contacts = contacts.doubled()
 
 
 def solids_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> Manifold:
     """What of the body lies flush along the plane: the points of a face or a side, and the support."""
-    room = len(delta) * POINTS
-    pair, feature, out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7))
-    outward, origin = (np.ascontiguousarray(column) for column in plane)
-    found = _planes(body, hulls, outward, origin, delta, pair, feature, out)
-    return manifold_of(pair[:found], feature[:found], out[:found])
+    contacts, (outward, origin) = Found.of(len(delta) * POINTS), map(np.ascontiguousarray, plane)
+    return contacts.manifold(_planes(body, hulls, outward, origin, delta, contacts))
 
 
 def _chain(functions: Sequence[Any]) -> Any:
@@ -427,9 +424,10 @@ def _across(frame):
 
 
 @loop
-def _pairs(first, second, hulls, delta, done, found, pair, feature, out):
+def _pairs(first, second, hulls, delta, done, found, contacts):
     """Add to the first contacts those of the pairs that are not done, as long as there is room; new numbers of pairs
     done and contacts found."""
+    pair, feature, out = contacts
     points, way, ends = np.empty((64, 2, 3)), np.empty((4, 3)), np.empty((4, 2), np.int64)
     share, parts, frame = np.empty(4), np.empty(6), np.empty((3, 3))
     point, name, flat = np.empty((2, POINTS, 3)), np.empty((2, POINTS), np.int64), np.empty((2, POINTS, 2))
@@ -496,8 +494,9 @@ def _pairs(first, second, hulls, delta, done, found, pair, feature, out):
 
 
 @loop
-def _planes(body, hulls, outward, origin, delta, pair, feature, out):
+def _planes(body, hulls, outward, origin, delta, contacts):
     """Fill in the contacts of shapes with half spaces; their number."""
+    pair, feature, out = contacts
     point, name, found = np.empty((POINTS, 3)), np.empty(POINTS, np.int64), 0
     for m in range(len(delta)):
         normal = vector_of(outward[m], 0)

@@ -107,10 +107,33 @@ class Polyhedra(NamedTuple):
     hull: Ints  #: (m,) rows of `hulls`
     hulls: Hulls
 
-    def columns(self) -> tuple[Floats, Floats, Floats, Ints]:
-        """Without the table of hulls, as loops take them."""
+    def contiguous(self) -> Polyhedra:
+        """The same, as loops take them."""
         center, turn, scale = (np.ascontiguousarray(column) for column in (self.center, self.turn, self.scale))
-        return center, turn, scale, self.hull
+        return self._replace(center=center, turn=turn, scale=scale)
+
+
+class Found(NamedTuple):
+    """Room for contacts, which loops fill in."""
+
+    pair: Ints  #: (room,)
+    feature: Ints  #: (room,)
+    out: Floats  #: (room, 7) points, normals and gaps
+
+    @classmethod
+    def of(cls, room: int) -> Found:
+        """Room for so many."""
+        return cls(np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7)))
+
+    def doubled(self) -> Found:
+        """The same with as much room again."""
+        return Found(*(np.concatenate([column, np.empty_like(column)]) for column in self))  # type: ignore[arg-type]
+
+    def manifold(self, found: int) -> Manifold:
+        """The contacts that are filled in."""
+        columns = self.out[:found, :3], self.out[:found, 3:6], self.out[:found, 6]
+        touch = Touch(*(np.ascontiguousarray(column) for column in columns))
+        return Manifold(self.pair[:found], self.feature[:found], touch)
 
 
 def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> Manifold:
@@ -120,33 +143,24 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
     """
     most = 4 * first.hulls.corner.shape[2] + 2 * first.hulls.vertex.shape[1]
     done, found, room = 0, 0, 4 * len(delta) + most
-    pair, feature, out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7))
-    sides = *first.columns(), *second.columns()
+    first, second, contacts = first.contiguous(), second.contiguous(), Found.of(room)
     while True:
-        done, found = _pairs(*first.hulls[2:], *sides, delta, most, done, found, pair, feature, out)
+        done, found = _pairs(first, second, delta, most, done, found, contacts)
         if done == len(delta):
-            return manifold_of(pair[:found], feature[:found], out[:found])
-        pair, feature, out = (np.concatenate([column, np.empty_like(column)]) for column in (pair, feature, out))
+            return contacts.manifold(found)
+        contacts = contacts.doubled()
 
 
 def spheres_polyhedra(ball: Spheres, body: Polyhedra, delta: Floats) -> Manifold:
     """One contact, at the closest point; a centre inside is pushed out through the nearest face."""
-    pair, out = np.empty(len(delta), np.int64), np.empty((len(delta), 7))
-    found = _spheres(*body.hulls[3:-1], *ball, *body.columns(), delta, pair, out)
-    return manifold_of(pair[:found], np.zeros(found, np.int64), out[:found])
+    contacts = Found.of(len(delta))
+    return contacts.manifold(_spheres(ball, body.contiguous(), delta, contacts))
 
 
 def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
     """The corners."""
-    room = len(delta) * body.hulls.vertex.shape[1]
-    pair, feature, out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7))
-    found = _planes(body.hulls.counts, body.hulls.vertex, *body.columns(), *plane, delta, pair, feature, out)
-    return manifold_of(pair[:found], feature[:found], out[:found])
-
-
-def manifold_of(pair: Ints, feature: Ints, out: Floats) -> Manifold:
-    """The contacts (k,) whose points, normals and gaps are the columns of `out` (k, 7)."""
-    return Manifold(pair, feature, Touch(*(np.ascontiguousarray(c) for c in (out[:, :3], out[:, 3:6], out[:, 6]))))
+    contacts = Found.of(len(delta) * body.hulls.vertex.shape[1])
+    return contacts.manifold(_planes(body.contiguous(), plane, delta, contacts))
 
 
 @loop
@@ -155,8 +169,11 @@ def _set(out, k, x, y, z, u, v, w, gap):
 
 
 @loop
-def _planes(count, vertex, center, turn, scale, hull, outward, origin, delta, pair, feature, out):
+def _planes(body, plane, delta, contacts):
     """Fill in the contacts of polyhedra with half spaces; their number."""
+    center, turn, scale, hull, hulls = body
+    count, vertex = hulls.counts, hulls.vertex
+    (outward, origin), (pair, feature, out) = plane, contacts
     found = 0
     for m in range(len(hull)):
         h = hull[m]
@@ -651,12 +668,13 @@ def _frame(normal, sign, one, other, frame):
 
 
 @loop
-def _pairs(
-    sharp, count, vertex, normal, corner, side, edge, wing, inset, center, turn, scale, hull, other_center, other_turn,
-    other_scale, other_hull, delta, most, done, found, pair, feature, out,
-):  # fmt: skip
+def _pairs(first, second, delta, most, done, found, contacts):
     """Add to the first contacts those of the pairs that are not done, as long as there is room for the `most` that a
     pair has; new numbers of pairs done and contacts found."""
+    center, turn, scale, hull, hulls = first
+    other_center, other_turn, other_scale, other_hull, _ = second
+    _, _, sharp, count, vertex, normal, corner, side, edge, wing, inset = hulls
+    pair, feature, out = contacts
     v, f, s, e = vertex.shape[1], normal.shape[1], corner.shape[2], edge.shape[1]
     points, normals, level = np.empty((2, v, 3)), np.empty((2, f, 3)), np.empty((2, f))
     slopes, axis, frame, place = np.empty((2, e, f)), np.empty(3), np.empty((3, 3)), np.empty((2, 3))
@@ -858,10 +876,11 @@ def _between(a, b, c, d, place):
 
 
 @loop
-def _spheres(
-    count, vertex, normal, corner, side, edge, wing, ball, radius, center, turn, scale, hull, delta, pair, out
-):
+def _spheres(spheres, body, delta, contacts):
     """Fill in the contacts of spheres with polyhedra; their number."""
+    (ball, radius), (center, turn, scale, hull, hulls) = spheres, body
+    count, vertex, normal, corner = hulls.counts, hulls.vertex, hulls.normal, hulls.corner
+    pair, feature, out = contacts
     points, normals, level = np.empty(vertex.shape[1:]), np.empty(normal.shape[1:]), np.empty(normal.shape[1])
     way, ends, share, parts = np.empty((4, 3)), np.empty((4, 2), np.int64), np.empty(4), np.empty(6)
     middle, found = np.zeros((1, 3)), 0
@@ -887,7 +906,7 @@ def _spheres(
             u, v, w = u / gap, v / gap, w / gap
         gap -= radius[m]
         ahead = radius[m] + 0.5 * gap
-        pair[found] = m
+        pair[found], feature[found] = m, 0
         _set(out, found, ball[m, 0] + ahead * u, ball[m, 1] + ahead * v, ball[m, 2] + ahead * w, u, v, w, gap)
         found += 1
     return found
