@@ -100,7 +100,7 @@ class Factor(NamedTuple):
         """out = (D L L' D')^-1 b."""
         of = self.blocks_of
         L = self.starts, self.below, self.L, self.unit
-        _solve(*L, self.pivots, self.scale, of.rows, of.size, self.work, b, out)
+        _solve(L, self.pivots, self.scale, of.rows, of.size, self.work, b, out)
 
 
 def factorised(of: Blocks, blocks: Array, tau: float, shift: float) -> Factor | int:
@@ -111,11 +111,12 @@ def factorised(of: Blocks, blocks: Array, tau: float, shift: float) -> Factor | 
     if not _scales(of.indptr, of.indices, blocks, of.number, of.size, scale):
         return BAD_BLOCK
     unit = np.sqrt(1.0 + shift) / 127.0  # the squares in a row of L sum to no more than 1 + shift
-    given = of.indptr, of.indices, blocks, of.number, of.order, scale, np.float32(tau**2), np.float32(shift), unit
+    matrix, order = (of.indptr, of.indices, blocks), (of.number, of.order)
+    given = matrix, order, scale, np.float32(tau**2), np.float32(shift), unit
     room, ended = 2 * len(of.indices) + n, FULL
     while ended == FULL and room <= MOST * len(of.indices) + n:
         below, L = np.empty(room, np.uint32), np.empty((room, 3, 4), np.int8)
-        ended = _factorise(*given, starts, pivots, below, L)
+        ended = _factorise(*given, starts, pivots, (below, L))
         room *= 3
     if ended != DONE:
         return ended
@@ -170,9 +171,10 @@ def _scales(indptr, indices, blocks, number, size, scale):
 
 
 @loop
-def _factorise(indptr, indices, blocks, number, order, scale, tau2, shift, unit, starts, pivots, rows, L):
+def _factorise(matrix, orders, scale, tau2, shift, unit, starts, pivots, factor):
     """The rows and blocks of L by columns, if there is room. Each column is that of T less the products of columns
     before it that have a block in its row; these are linked in lists."""
+    (indptr, indices, blocks), (number, order), (rows, L) = matrix, orders, factor
     n, m = len(order), 0
     found, w, place = np.empty(n, np.int32), np.empty((n, 3, 4), np.float32), np.full(n, -1, np.int32)
     sorted_rows, slot = np.empty(n + 1, np.int32), np.empty(n + 1, np.int32)  # of those that are kept
@@ -282,8 +284,9 @@ def _factorise(indptr, indices, blocks, number, order, scale, tau2, shift, unit,
 
 
 @loop
-def _solve(starts, below, L, unit, pivots, scale, rows, size, x, b, out):
+def _solve(factor, pivots, scale, rows, size, x, b, out):
     """Unsigned places: they need no test for negative ones."""
+    starts, below, L, unit = factor
     n, t = len(pivots), np.empty((3, 4))
     x[:] = 0.0
     for j in range(n):

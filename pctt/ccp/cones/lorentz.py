@@ -137,7 +137,7 @@ class ArrowInverse(NamedTuple):
         lorentz, parts_of = self.lorentz, self.lorentz.width // 3
         out = np.zeros((lorentz.count, lorentz.width))
         parts = self.right, self.left, self.D, self.part, self.sigma
-        _alone(f, joined(r, parts_of), lorentz.weight.ravel(), lorentz.place, self.tangential, *parts, out)
+        _alone(f, joined(r, parts_of), lorentz.weight.ravel(), lorentz.place, self.tangential, parts, out)
         return rows(out, parts_of)
 
 
@@ -221,7 +221,8 @@ def _arrows(root, size, u, weight, live, place, normal, tangential, X):
 
 
 @loop
-def _alone(f, r, weight, place, tangential, right, left, D, part, sigma, out):
+def _alone(f, r, weight, place, tangential, parts, out):
+    right, left, D, part, sigma = parts
     count, total = len(out), len(f)
     for c in range(count):
         normal = -r[c, 0]

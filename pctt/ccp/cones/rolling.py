@@ -84,8 +84,8 @@ class RollingCones(Cones):
     def accelerated_step(
         self, x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, coulomb: bool, out: Array
     ) -> tuple[float, float, float]:
-        given = x, last_x, y, compliance, beta, step, self.mu, self.rolling, self.spinning
-        return accelerated_step(*given, float(coulomb), out)
+        coefficients = self.mu, self.rolling, self.spinning
+        return accelerated_step(x, last_x, y, compliance, beta, step, coefficients, float(coulomb), out)
 
 
 @inlined
@@ -140,10 +140,11 @@ def project_to(x: Array, mu: Array, rho: Array, sigma: Array, out: Array) -> Arr
 
 @loop
 def accelerated_step(
-    x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, rho: Array,
-    sigma: Array, de_saxce: float, out: Array,
+    x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float,
+    coefficients: tuple[Array, Array, Array], de_saxce: float, out: Array,
 ) -> tuple[float, float, float]:  # fmt: skip
     """`pctt.ccp.cones.friction.accelerated_step` for these cones: both halves of the rows go through strips."""
+    mu, rho, sigma = coefficients
     count, soft = len(sigma), len(compliance) > 0
     part, way, saxce = x.dtype.type(beta), x.dtype.type(step), x.dtype.type(de_saxce)
     x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
@@ -162,7 +163,7 @@ def accelerated_step(
         else:
             y_z[: b - a] = y[a:b]
         _add_de_saxce(y_z, y[d:e], saxce, friction, rolling, here)
-        _step(z, y_z, turns, y[d:e], way, friction, rolling, here, to[a:b], to[d:e])
+        _step(z, y_z, turns, y[d:e], way, (friction, rolling, here), to[a:b], to[d:e])
         add_squares(to[a:b], z, squares)
         add_squares(to[d:e], turns, squares)
         add_products(to[a:b], x[a:b], y_z, products)
@@ -181,7 +182,8 @@ def _add_de_saxce(y, turns, saxce, mu, rho, sigma):
 
 
 @loop
-def _step(x, y, turned, turning, step, mu, rho, sigma, out, moments):
+def _step(x, y, turned, turning, step, coefficients, out, moments):
+    mu, rho, sigma = coefficients
     for c in range(len(mu)):
         i = 3 * c
         p0, p1, p2 = x[i] - step * y[i], x[i + 1] - step * y[i + 1], x[i + 2] - step * y[i + 2]

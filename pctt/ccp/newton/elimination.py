@@ -44,6 +44,10 @@ class Order(NamedTuple):
         """Contacts in the rest."""
         return len(self.number) - self.head
 
+    def columns(self) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+        """What loops take of it: all but ``target``."""
+        return self.head, self.number, self.starts, self.rows
+
 
 def ordered(indptr: np.ndarray, indices: np.ndarray, most_pairs: int, most_rest: int) -> Order | None:
     """The order for a symmetric pattern of blocks (nc, nc) in CSR; None if the elimination has more than ``most_pairs``
@@ -62,8 +66,7 @@ class Factors:
         #: lower blocks, and the transposes of the upper ones; the diagonal is in the first
         self._lower = np.zeros((order.head + len(order.rows) + order.rest**2, 3, 3))
         self._upper = self._lower if symmetric else np.zeros_like(self._lower)
-        given = order.head, order.number, order.starts, order.rows
-        _place(N.indptr, N.indices, N.data, diagonal, *given, self._lower, self._upper)
+        _place((N.indptr, N.indices, N.data, diagonal), order.columns(), self._lower, self._upper)
         _eliminate(order.head, order.starts, order.target, self._lower, self._upper, symmetric)
         if order.rest:
             self._factorise_rest(symmetric)
@@ -83,14 +86,14 @@ class Factors:
         """x (nc, 3) with |b - S x| at most ``wanted``, refined where it must be, and the solves that this took; 0 if it
         was not reached."""
         x, left, change, order = np.zeros_like(b), b.copy(), np.empty_like(b), self.order
-        given = order.head, order.number, order.starts, order.rows, self._lower
+        given = order.columns(), self._lower
         S = self.N.indptr, self.N.indices, self.N.data, self.diagonal
         for count in range(1, ROUNDS + 1):
             _forward(*given, left, change)
             if order.rest:
                 of_rest = change[order.head :].reshape(-1)
                 of_rest[:] = self._solve(*self._of_rest, of_rest, **self._side)[0]
-            if _backward(*given, self._upper, *S, b, change, x, left) <= wanted**2:
+            if _backward(*given, self._upper, S, b, change, x, left) <= wanted**2:
                 return x, count
         return x, 0
 
@@ -176,8 +179,9 @@ def _ordered(indptr, indices, full, least, most):
 
 
 @loop
-def _place(indptr, indices, blocks, diagonal, head, number, starts, rows, lower, upper):
+def _place(S, order, lower, upper):
     """Put the blocks of S where the factors have them."""
+    (indptr, indices, blocks, diagonal), (head, number, starts, rows) = S, order
     rest = len(number) - head
     for c in range(len(number)):
         i = number[c]
@@ -263,8 +267,9 @@ def _dense(lower, upper, out):
 
 
 @loop
-def _forward(head, number, starts, rows, lower, left, x):
+def _forward(order, lower, left, x):
     """What the elimination makes of ``left``: x in its order."""
+    head, number, starts, rows = order
     for c in range(len(x)):
         i = number[c]
         x[i, 0], x[i, 1], x[i, 2] = left[c, 0], left[c, 1], left[c, 2]
@@ -281,8 +286,9 @@ def _forward(head, number, starts, rows, lower, left, x):
 
 
 @loop
-def _backward(head, number, starts, rows, lower, upper, indptr, indices, blocks, diagonal, b, change, x, left):
+def _backward(order, lower, upper, S, b, change, x, left):
     """Solve for the head, and add the ``change`` to x; what is ``left`` = b - S x, and its square."""
+    (head, number, starts, rows), (indptr, indices, blocks, diagonal) = order, S
     for k in range(head - 1, -1, -1):
         u, v, w = 0.0, 0.0, 0.0
         for p in range(starts[k], starts[k + 1]):
