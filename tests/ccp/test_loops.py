@@ -84,15 +84,20 @@ class Sample:
             "project": (cone.project, nearest, (x, mu)),
             "step": (stepped, accelerated_step, (x, dx, y, np.abs(dy), 0.7, 0.3, mu, 1.0)),
             "rigid step": (stepped, accelerated_step, (x, dx, y, dy[:0], 0.7, 0.3, mu, 0.0)),
-            "errors": (cone.errors, errors, (x, y, dy, 0.3, mu, 0.0, units)),
-            "errors of Coulomb's law": (cone.errors, errors, (x, y, dy, 0.3, mu, 1.0, units[:0])),
+            "errors": (summed, errors, (x, y, dy, 0.3, mu, 0.0, units)),
+            "errors of Coulomb's law": (summed, errors, (x, y, dy, 0.3, mu, 1.0, units[:0])),
             "times": (cone.times, times, (blocks, x)),
         }  # fmt: skip
 
 
 def stepped(x, last_x, y, compliance, beta, step, mu, opening):
     out = np.zeros_like(x)
-    return *cone.accelerated_step(x, last_x, y, compliance, beta, step, mu, opening, out), out
+    return *cone.accelerated_step(x, last_x, y, compliance, beta, step, mu, opening, out).sum(axis=0), out
+
+
+def summed(*arguments):
+    sums, most = cone.errors(*arguments)
+    return sums.sum(axis=1), most.max()
 
 
 NAMES = list(Sample(0).cases)
