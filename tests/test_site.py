@@ -53,6 +53,13 @@ def test_every_public_class_has_an_example(pages):
     assert classes == set(pages.cells())  # docs/api_examples.py
 
 
+def test_docstrings_with_sections_have_no_lists_outside_of_them(pages):
+    """docs/conf.py makes fields of "name : meaning" where there are no sections; elsewhere numpydoc needs a heading."""
+    for name, thing in pages.homes().items():
+        before, dashes, _ = (inspect.getdoc(thing) or "").partition("\n---")
+        assert not dashes or not re.search(r"^[a-z]\w*(, \w+)* : ", before, re.MULTILINE), name
+
+
 def test_all_options_are_in_the_tables(pages):
     from pctt.run.help import help_text
 
