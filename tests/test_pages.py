@@ -1,9 +1,12 @@
-"""The programs in README and docs run as they are printed; what a page presumes is given to them here."""
+"""The programs in README and docs run as they are printed; what a page presumes is given to them here. What pages name
+exists: links, files, modules and their members, extras."""
 
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ from pctt import ccp
 from pctt.ccp import fclib
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
 
 
 def blocks(page: str) -> list[str]:
@@ -141,3 +145,34 @@ def test_a_problem_is_copied_as_on_the_page_of_files(in_folder):
     exec("\n".join(lines), {"comm": MPI.COMM_SELF})
     copy = fclib.load(in_folder / "copy.hdf5", MPI.COMM_SELF)
     assert (copy.title, copy.problem.size) == ("a title", 3)
+
+
+# -- what pages name -------------------------------------------------------------------------------------------------
+
+
+def anchors(page: Path) -> set[str]:
+    """Those of the headings of a page, as GitHub and the site make them."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    heads = [re.sub(r"\[(.*?)\]\(.*?\)", r"\1", head) for head in re.findall(r"^#{1,3} (.+)$", text, re.MULTILINE)]
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_to_pages_and_headings(page):
+    for file, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)#?([^)\s]*)\)", page.read_text()):
+        place = (page.parent / file) if file else page
+        if "made" in place.parts or place.name == "options.md":
+            continue  # made of the code when the site is built
+        assert place.exists(), file
+        assert not anchor or anchor in anchors(place), f"{file}#{anchor}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_modules_members_and_extras_exist(page):
+    text = page.read_text()
+    for file in re.findall(r"`((?:dem|pctt|tests|run|docs)/[\w./]+)`", text):
+        assert (ROOT / file).exists(), file
+    for name in set(re.findall(r"`((?:dem|pctt)(?:\.\w+)+)\b", text)):
+        resolve_name(name)
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert {extra for extra in re.findall(r"'\.\[(\w+)\]'", text)} <= set(extras)
