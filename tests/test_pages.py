@@ -4,13 +4,13 @@ exists: links, files, modules and their members, extras."""
 from __future__ import annotations
 
 import re
-import tomllib
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
 import pytest
+import tomllib
 from mpi4py import MPI
 from petsc4py import PETSc
 
