@@ -1,21 +1,29 @@
-"""The programs in README and docs run as they are printed; what a page presumes is given to them here."""
+"""The programs in README and docs run as they are printed; what a page presumes is given to them here. What pages name
+exists: links, files, modules and their members, extras."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
 import pytest
+import tomllib
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.experiment import from_file
+from dem.parts.contact_law import ContactLaw
+from dem.parts.sources import Source
 from pctt import ccp
 from pctt.ccp import fclib
+from pctt.run.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
 
 
 def blocks(page: str) -> list[str]:
@@ -107,14 +115,6 @@ def test_the_program_of_the_readme_solves_by_a_train(in_folder, capfd):
     ksp.destroy()
 
 
-def test_the_cone_problem_of_its_page_is_solved(in_folder, capsys):
-    stored_problem(in_folder / "problem.hdf5")
-    names: dict[str, Any] = {}
-    exec(blocks("docs/ccp.md")[1], names)
-    assert names["result"].converged
-    assert "natural residual and closing work below the tolerance" in capsys.readouterr().out
-
-
 def test_a_cone_problem_handed_over(capsys):
     names: dict[str, Any] = {}
     exec(blocks("docs/ccp.md")[0], names)
@@ -135,9 +135,62 @@ def test_poisson_with_a_train(in_folder, capfd):
         PETSc.Options().delValue(name)
 
 
-def test_a_problem_is_copied_as_on_the_page_of_files(in_folder):
+def test_a_problem_is_solved_and_copied_as_on_the_page_of_files(in_folder, capsys):
     stored_problem(in_folder / "problem.hdf5")
     lines = [line for line in blocks("docs/files.md")[0].splitlines() if "write_global" not in line]
     exec("\n".join(lines), {"comm": MPI.COMM_SELF})
+    assert "natural residual and closing work below the tolerance" in capsys.readouterr().out
     copy = fclib.load(in_folder / "copy.hdf5", MPI.COMM_SELF)
     assert (copy.title, copy.problem.size) == ("a title", 3)
+
+
+# -- what pages name -------------------------------------------------------------------------------------------------
+
+
+def anchors(page: Path) -> set[str]:
+    """Those of the headings of a page, as GitHub and the site make them."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    heads = [re.sub(r"\[(.*?)\]\(.*?\)", r"\1", head) for head in re.findall(r"^#{1,3} (.+)$", text, re.MULTILINE)]
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_to_pages_and_headings(page):
+    for file, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)#?([^)\s]*)\)", page.read_text()):
+        place = (page.parent / file) if file else page
+        if "made" in place.parts or place.name == "options.md":
+            continue  # made of the code when the site is built
+        assert place.exists(), file
+        assert not anchor or anchor in anchors(place), f"{file}#{anchor}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_modules_members_and_extras_exist(page):
+    text = page.read_text()
+    for file in re.findall(r"`((?:dem|pctt|tests|run|docs)/[\w./]+)`", text):
+        assert (ROOT / file).exists(), file
+    for name in set(re.findall(r"`((?:dem|pctt)(?:\.\w+)+)\b", text)):
+        resolve_name(name)
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert {extra for extra in re.findall(r"'\.\[(\w+)\]'", text)} <= set(extras)
+
+
+def table(page: str, head: str) -> list[list[str]]:
+    """The cells of the rows of a page's table that begins with this head."""
+    rows = (ROOT / page).read_text().partition(f"{head}\n|")[2].splitlines()[1:]
+    ends = next(k for k, row in enumerate(rows) if not row.startswith("|"))
+    return [[cell.strip() for cell in row[1:-1].split(" | ")] for row in rows[:ends]]
+
+
+def test_tables_of_coefficients_and_arguments_are_whole():
+    """Every field of the code has a row, and every row a field."""
+    laws = " ".join(row[0] for row in table("docs/contact_laws.md", "| coefficient | unit | default | law |"))
+    assert set(re.findall(r"`(\w+)`", laws)) == {field.name for field in dataclasses.fields(ContactLaw)}
+    sources = " ".join(row[0] for row in table("docs/sources.md", "| argument | default | meaning | unit |"))
+    assert set(re.findall(r"`(\w+)`", sources)) == {field.name for field in dataclasses.fields(Source)} - {"before"}
+
+
+def test_the_defaults_of_the_limits_are_those_of_the_code():
+    rows = table("docs/accuracy.md", "| | `-ccp_tol` | `-ccp_closing_work` | `-ccp_closing_speed` |")
+    for (_, tol, work, _), limits in zip(rows, (Settings(), ccp.Limits())):
+        assert (float(tol), float(work)) == (limits.tol, limits.closing_work)

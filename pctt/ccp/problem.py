@@ -43,6 +43,11 @@ class ConeProblem:
     unknowns, or directly (``N``). The compliance C is diagonal: contacts that yield a little, see
     `dem.start.stiffness`. Arrays and scipy matrices are the rows of this rank's contacts, with the columns of all.
 
+    ValueError on all ranks for data of other shapes, or that are no numbers, for negative coefficients, and for
+    matrices that are not symmetric.
+
+    Parameters
+    ----------
     r : (nc, 3) velocities of the contacts without impulses, plus gap/dt (m/s); (nc, 2) for contacts of the plane, whose
         N and G have two rows for each, of the normal and of the tangent
     mu : (nc,) friction coefficients, or (nc, 2), of each tangent, in elliptic cones |g_1 / mu_1, g_2 / mu_2| <= g_n
@@ -54,9 +59,6 @@ class ConeProblem:
     masses : of all n columns of G, whole on every rank: (n,) numbers, a matrix, a factor with ``solve(b)``, the pair of
         `scipy.linalg.cho_factor`, a function b -> M^-1 b; a PETSc Vec, Mat or KSP. Without them M is the identity. If
         they are no numbers N is made by one solve for each row
-
-    ValueError on all ranks for data of other shapes, or that are no numbers, for negative coefficients, and for
-    matrices that are not symmetric.
 
     Attributes
     ----------

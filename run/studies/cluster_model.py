@@ -361,12 +361,12 @@ class Model:
         lists = self._bed(ranks, contacts)["touched_s"] + ranks * BOXES / self.bandwidth
         return work, self.others + OUTSIDE * self.reduction(ranks) + self.alone[-1]["new_lists"] * lists
 
-    def cells(self, ranks: int, contacts: float, its: float) -> list[str]:
-        """Microseconds of an iteration, with the part that is work; milliseconds of a step."""
+    def cell(self, ranks: int, contacts: float, its: float) -> str:
+        """Milliseconds of a step, with the part of an iteration that is work."""
         work, exchange, reductions, _ = self.iteration(ranks, contacts)
         whole = work + exchange + reductions
         step = its * whole + sum(self.outside(ranks, contacts))
-        return [f"{1e6 * whole:,.0f} ({work / whole:.2f})", f"{1e3 * step:,.3g}"]
+        return f"{1e3 * step:,.3g} ({work / whole:.2f})"
 
 
 def main() -> None:
@@ -403,12 +403,11 @@ def main() -> None:
         print(f"n = {row['n']}, two ranks: an iteration takes {1e6 * two['iteration_s']:.0f} us, by the model "
               f"{1e6 * whole:.0f}; outside {1e3 * two['outside_s']:.1f} ms, {1e3 * outside:.1f}")  # fmt: skip
     model, its = Model(alone, both, beds, about["own"], words.latency, words.bandwidth), alone[-1]["its"]
-    heads = ["ranks", *(f"n = {n}, {what}" for n in SIZES for what in ("iteration, us", "step, ms"))]
-    heads += [f"{SHARE:,} contacts a rank, iteration, us", f"{SHARE:,} contacts a rank, step, ms"]
+    heads = ["ranks", *(f"n = {n}" for n in SIZES), f"{SHARE:,} contacts a rank"]
     of_ranks = [ranks for ranks in MODEL if ranks <= beds[-1]["ranks"]]
     sizes = [[contacts for _, contacts in SIZES.values()] + [ranks * SHARE] for ranks in of_ranks]
     print(markdown(heads, [
-        [ranks, *(cell for contacts in row for cell in model.cells(ranks, contacts, its))]
+        [ranks, *(model.cell(ranks, contacts, its) for contacts in row)]
         for ranks, row in zip(of_ranks, sizes)
     ]))  # fmt: skip
     ranks = of_ranks[-1]

@@ -34,11 +34,10 @@ def seconds(cell: str) -> float:
 
 def cluster(axes: Any) -> None:
     """Milliseconds of a step against ranks, by the model."""
-    heads, rows = table("cluster.md", "| ranks | n = 8, iteration")
+    heads, rows = table("cluster.md", "| ranks | n = 8 |")
     ranks = [seconds(row[0]) for row in rows]
-    for k, label in enumerate(heads):
-        if label.endswith(", step, ms"):
-            axes.plot(ranks, [seconds(row[k]) for row in rows], "o-", label=label.removesuffix(", step, ms"))
+    for k, label in enumerate(heads[1:], 1):
+        axes.plot(ranks, [seconds(row[k]) for row in rows], "o-", label=label)
     axes.set(xscale="log", yscale="log", xlabel="ranks", ylabel="ms of a step, by the model")
 
 

@@ -150,7 +150,7 @@ def table(rows: list[Row]) -> str:
             off = "inside" if row["deviation"] == 0.0 else f"{100 * row['deviation']:+.2g} %"
         found, off = f"{row['found']:.4g}{error}{unit}", off if row["agrees"] else f"**{off}**"
         lines.append([row["check"], row["quantity"], expected, found, off, row["source"]])
-    for line, before in reversed(list(pairwise(lines))):  # what repeats stands in its first row
+    for before, line in reversed(list(pairwise(lines))):  # what repeats stands in its first row
         line[0], line[5] = line[0] * (line[0] != before[0]), line[5] * (line[5] != before[5])
     return markdown(["", "quantity", "reference", "found", "deviation", "source"], lines)
 
@@ -201,10 +201,9 @@ def main(names: Sequence[str]) -> None:
         files = [RUNS / name / "steps.jsonl" for name in names]
         lines = [json.loads(line) for file in files for line in file.read_text().splitlines()]
         missed = sum(not line["converged"] for line in lines)
-        cores = min(2, os.cpu_count() or 1)
-        about["minutes"] = seconds / 60 / cores
+        about["minutes"] = seconds / 60
         text = TEXT.read_text("utf-8").format(
-            minutes=about["minutes"], cores=cores, cpu_minutes=seconds / 60, cpu=about["cpu"], table=table(rows),
+            cpu_minutes=seconds / 60, cpu=about["cpu"], table=table(rows),
             beds=len(SEEDS), bodies={name: Folder(RUNS / name).summary["bodies"] for name in names},
             rubs=shown["column"]["rubs"], scatter=shown["heap"]["scatter"], solved=solved(missed, len(lines)),
             outlets=", ".join(f"{outlet:g}" for outlet in OUTLETS),

@@ -22,6 +22,7 @@ import several_ranks
 from mpi4py import MPI
 from program import database
 from test_pages import blocks, stored_problem
+from validate import CHECKS
 
 from pctt import export, plot, render
 from pctt.ksp_options import OF_SOLVERS
@@ -49,7 +50,7 @@ NOT_OURS = {
     **dict.fromkeys(("export", ".", "#SBATCH", "module"), "sets variables of the shell"),
 }
 #: Commands of this repository that are no study: their words are those of other programs.
-OTHERS = {"demo", "test", "setup", "docs", "lint", "release", "elsewhere", "validate"}
+OTHERS = {"demo", "test", "setup", "docs", "lint", "release", "elsewhere"}
 OF_PETSC = ("log_view", "options_file", "options_left", "help", "version")
 
 
@@ -113,6 +114,15 @@ def test_all_other_lines_that_look_like_commands_are_known():
             ours = STARTS.fullmatch(line) or re.match(r"(mpiexec -n \d+ )?\S*python (-c |docs/|-m mpi4py )", line)
             other = any(word.rpartition("/")[2] in NOT_OURS for word in line.split()[:3])
             assert ours or other or not launch.fullmatch(line) or " ..." in line, f"{page.name}: {line}"
+
+
+def test_other_scripts_of_this_repository_are_there():
+    """Those in folders of `run`, and the examples that are programs."""
+    for page in [*PAGES, *EXAMPLES]:
+        for line in [*lines_of(page), *pieces_of(page)]:
+            for script in re.findall(r"(?:^|\s)(run/\w+/\w+|docs/examples/\w+\.py)(?=\s|$)", line):
+                assert (ROOT / script).is_file(), f"{page.name}: {line}"
+                assert script.endswith(".py") or os.access(ROOT / script, os.X_OK), script
 
 
 @pytest.fixture(scope="module")
@@ -212,8 +222,11 @@ def test_the_words_of_a_line_are_right(page, program, text, folder, monkeypatch,
                 check_run([*(["-compare", words[words.index("-names") + 1]] if "-names" in words else []), *rest])
             else:
                 assert not rest
+        elif name == "validate":
+            assert {*words} <= {*CHECKS, "-keep", *STAND_FOR.values()}
         else:
             assert name in {*OTHERS, "settle", "study"}
+            assert all((ROOT / word).exists() for word in words if "/" in word)
 
 
 # -- the cheap ones --------------------------------------------------------------------------------------------------

@@ -43,6 +43,16 @@ def test_a_band_tells_how_far_off_a_figure_is():
     assert row("sliding", "lift", 0.0, 1e-9, "", "m", 1e-6)["agrees"] is True
 
 
+def test_what_repeats_in_the_table_stands_in_its_first_row():
+    from validate import table
+    from validation.rows import row
+
+    which = [("silo", "Beverloo"), ("silo", "Beverloo"), ("silo", "Mankoc"), ("drum", "Mankoc")]
+    rows = table([row(check, "flow", 1.0, 1.0, source, "", 0.1) for check, source in which]).splitlines()[2:]
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in rows]
+    assert [(line[0], line[-1]) for line in cells] == [("silo", "Beverloo"), ("", ""), ("", "Mankoc"), ("drum", "")]
+
+
 def test_angles_of_a_heap_are_means_with_an_error(monkeypatch):
     """Two beds a degree apart: a scatter of sqrt(1/2), an error of the mean of 1/2, of a difference of sqrt(1/2)."""
     angles = {"a": 14.0, "b": 15.0, "c": 24.0, "d": 25.0, "e": 25.0, "f": 26.0}

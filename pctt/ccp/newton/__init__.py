@@ -45,6 +45,8 @@ _ASKED = {OWN + "pc_type", OWN + "ksp_type"}  # options that say how a system is
 class Newton:
     """A `Newton` object makes and solves the Newton systems of one cone problem after another.
 
+    Parameters
+    ----------
     form : of FORMS. The body form has its own solver unless the options name a KSP or PC; a problem of few contacts, or
         one that knows no bodies (given by N), is solved in the form `contact` instead, by factors.
 

@@ -17,7 +17,7 @@ from pctt.folder import Folder
 MANKOC = "Mankoc et al. 2007 (arXiv:0707.4550)"
 DOSTA = "Dosta et al. 2024, eight codes, as Peclet tells"
 CODES = "MUSEN and LIGGGHTS by Peclet, on the case of Dosta et al. 2024"
-LUBE = "Lajeunesse, Mangeney-Castelnau, Vilotte 2004; Lube, Huppert, Sparks, Hallworth 2004"
+LUBE = "Lajeunesse et al. 2004; Lube et al. 2004"
 VESIC = "bearing capacity: Prandtl, Reissner; Vesić 1973 for a disc"
 BRZINSKI = "Brzinski, Mayor, Durian 2013 (arXiv:1307.4638): 35 tan(angle)"
 

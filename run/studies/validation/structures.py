@@ -190,7 +190,7 @@ def at_rest() -> list[Row]:
         while sim.time < 2.0:
             sim.step()
             force.append(-sim.body("floor").force[2] / weight)
-        what = f"{name}: standard deviation of the force on the floor, over the weight"
+        what = f"{name}: deviation of the force on the floor, over the weight"
         out.append(row("at rest", what, 0.0, float(np.std(force)), "balance of forces", "", 5e-3))
         out.append(row("at rest", "the same: its mean over the weight", 1.0, float(np.mean(force)), "balance of forces",
                        "", 1e-3))  # fmt: skip
