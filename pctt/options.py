@@ -111,9 +111,9 @@ _TYPES: dict[Any, type] = {int: numbers.Integral, float: numbers.Real, bool: boo
 
 
 def _kind(hint: Any) -> Any:
-    """The X of Optional[X], or of any other X."""
-    inner = [kind for kind in typing.get_args(hint) if kind is not type(None)]
-    return inner[0] if inner else hint
+    """The X of Optional[X]; of any other hint itself."""
+    kinds = typing.get_args(hint)
+    return next(kind for kind in kinds if kind is not type(None)) if type(None) in kinds else hint
 
 
 def _allowed(kind: Any, metadata: Mapping[str, Any]) -> str:
