@@ -239,9 +239,11 @@ class Simulation:
         stop: Callable[[Simulation], bool] | None = None,
         every: int = 1,
         call: Callable[[Simulation], object] | None = None,
+        progress: bool = False,
     ) -> None:
         """Make steps until the time ``until`` [s], or so many ``steps``, or until ``stop(self)`` is true after one,
-        whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`."""
+        whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`.
+        ``progress``: say where it is, and how long it goes on."""
         if bare:
             says = ", ".join(map(repr, bare))
             raise OptionError(f"run({says}): steps or seconds? allowed is run(steps={says}), or run(until={says}) [s]")
@@ -254,6 +256,8 @@ class Simulation:
         if until is not None:
             left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
         first, end, ends = self.steps, self.steps + left, False
+        told = report.Progress(self.comm, quiet=not progress)
+        told.passed(first, self.time, end)
 
         def tell() -> bool:
             if call is not None and (self.steps - first) % every == 0:
@@ -266,6 +270,7 @@ class Simulation:
                 ends = tell()
             elif call or stop:  # an error of one rank is one of all, and the first rank decides
                 ends = self.comm.bcast(together(self.comm, "call or stop of run", tell))
+            told.passed(self.steps, self.time, self.steps if ends else end)
         self.complete()
 
     # -- what there is ---------------------------------------------------------------------------------------
