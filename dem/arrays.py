@@ -51,6 +51,12 @@ class Rule:
             yield first, self[first : first + self.CHUNK]
 
 
+def frozen(array: np.ndarray) -> np.ndarray:
+    """The array, which nobody can write to from now on."""
+    array.flags.writeable = False
+    return array
+
+
 class Tabular:
     """A table whose fields are arrays (n,) or (n, parts): ``dict(table)`` has a column (n,) for each part, and so has
     ``pandas.DataFrame(dict(table))``."""

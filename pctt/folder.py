@@ -213,7 +213,7 @@ class Folder:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         if not self.path.is_dir():
-            raise FileError(f"{path}: no such folder; it is the -output of python -m pctt.run")
+            raise FileError(f"{path}: no such folder of a run")
         if not any((self.path / name).is_file() for name in ("settings.json", "steps.jsonl", "summary.json")):
             raise FileError(f"{path}: no output folder of python -m pctt.run (it has no steps.jsonl)")
         self.steps = sorted(int(path.stem) for path in self._frames.glob("*.h5") if path.stem.isdigit())
@@ -243,7 +243,7 @@ class Folder:
     def require_frames(self) -> None:
         """Read the shapes of the bodies; FileError if these, or recorded steps, are missing."""
         if not self.steps:
-            raise FileError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
+            raise FileError(f"{self.path}: no recorded steps; output_every, of write in Python every, must be 1 or more")
 
         def take(file: h5py.File) -> list[Any]:
             same_rows(file, TABLE[1:])

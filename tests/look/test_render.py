@@ -132,7 +132,7 @@ def test_bodies_have_the_colours_that_are_given():
 def test_a_body_is_drawn_in_its_colour_or_not_at_all(render, folder, tmp_path):
     pure = []
     for name, bodies in {"red": "mixer=red", "alone": "box=none,mixer=red", "hidden": "mixer=none"}.items():
-        render("-output", tmp_path / name, "-first", 4, "-bodies", bodies, folder=folder)
+        render("-output", tmp_path / name, "-first", 4, "-cut", "-bodies", bodies, folder=folder)
         red, green, blue = np.moveaxis(pixels(tmp_path / name / "000004.png")[:, :275], 2, 0)
         pure.append(np.count_nonzero((red > 100) & (green < 40) & (blue < 40)))
     assert min(pure[:2]) > 100
