@@ -602,8 +602,8 @@ class Scene:
         return "; ".join(filter(None, found))
 
     def figures(self) -> dict[str, str]:
-        """What tells the scene from others with as many bodies, to five digits: gravity, coefficients of contact, masses
-        and sizes, materials."""
+        """What tells the scene from others with as many bodies, to five digits: gravity, coefficients of contact,
+        masses, sizes, materials."""
         laws = {"": self._law}
         laws |= {f" of {self.materials[a]} with {self.materials[b]}": law for (a, b), law in self._pairs.items()}
         found = {name + pair: value for pair, law in laws.items() for name, value in vars(law).items()

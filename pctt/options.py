@@ -91,7 +91,7 @@ def made(group: type[Group], values: Mapping[str, Any]) -> Group:
     known = [f.name for f in dataclasses.fields(group)]  # type: ignore[arg-type]
     for name in values:
         if name not in known:
-            raise OptionError(f"{name}: no such setting; allowed are {', '.join(known)}{nearest(name, known, alike=0.5)}")
+            raise OptionError(f"{name}: no such setting; allowed are {', '.join(known)}{nearest(name, known)}")
     return group(**values)
 
 

@@ -49,7 +49,10 @@ def arguments() -> tuple[argparse.Namespace, View]:
     if given.range and (given.color == "material" or not given.range[0] < given.range[1]):
         low, high = given.range
         line.error(f"-range {low:g} {high:g}: allowed are two numbers that rise, and not with -color material")
-    view = View(given.azimuth, given.elevation, given.zoom, given.opacity, given.cut, *given.size, given.bodies)
+    width, height = given.size
+    view = View(
+        given.azimuth, given.elevation, given.zoom, given.opacity, given.cut, width, height, given.bodies
+    )  # fmt: skip
     try:
         refuse_bad(view)
     except OptionError as error:

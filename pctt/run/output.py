@@ -44,9 +44,10 @@ def refusal(folder: Path, restart: str, overwrite: bool, program: bool) -> str:
     there = _held(folder)
     if not there or overwrite or _goes_on(folder, restart):
         return ""
-    path = str(folder / "checkpoint.h5")
-    ways = ("-overwrite", f"-restart {quote(path)}") if program else ("overwrite=True", f"Simulation.load({path!r}, ...)")
-    goes_on = f", or {ways[1]} to go on with it" * ("checkpoint.h5" in there)
+    path, ways = str(folder / "checkpoint.h5"), ("overwrite=True", "Simulation.load({!r}, ...)")
+    if program:
+        path, ways = quote(path), ("-overwrite", "-restart {}")
+    goes_on = f", or {ways[1].format(path)} to go on with it" * ("checkpoint.h5" in there)
     allowed = f"another folder, {ways[0]} to replace that run{goes_on}"
     return f"{'-output ' * program}{folder}: holds a run ({', '.join(there)}); allowed is {allowed}"
 
@@ -93,7 +94,8 @@ class Place:
         def begin() -> tuple[bool, Path]:
             folder.mkdir(parents=True, exist_ok=True)
             if not self._lock.take():
-                raise FileError(f"{'-output ' * program}{folder}: another run is writing there; allowed is another folder")
+                name = f"{'-output ' * program}{folder}"
+                raise FileError(f"{name}: another run is writing there; allowed is another folder")
             if refused := refusal(folder, restart, overwrite, program):
                 self.leave()
                 raise FileError(refused)

@@ -261,10 +261,14 @@ def _refuse_other_origin(
 
 def _tell_other_origin(path: Path, old: dict[str, Any], new: dict[str, Any], comm: MPI.Comm) -> None:
     """Warn of what else differs between two origins."""
+
+    def value(figures: dict[str, str], name: str) -> str:  # of a pair without coefficients of its own those of all
+        return figures.get(name, figures.get(name.partition(" of ")[0], "none"))
+
     before, now = json.loads(old["figures"]), json.loads(new["figures"])
     names = [name for name in {**now, **before} if before.get(name) != now.get(name)]
     if names:
-        told = ", ".join(f"{name} {before.get(name, 'none')}, now {now.get(name, 'none')}" for name in names[:10])
+        told = ", ".join(f"{name} {value(before, name)}, now {value(now, name)}" for name in names[:10])
         holds = "gravity and laws of contact are those of now, masses, sizes and materials those of before"
         warn(comm, f"{path} was made with {told}{', and more' * (len(names) > 10)}; {holds}")
     for name, what in {"scene_file": "another text of the scene file", "surfaces": "other surfaces of bodies"}.items():
