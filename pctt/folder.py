@@ -119,7 +119,7 @@ def totals(steps: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 # -- reading -------------------------------------------------------------------------------------------------
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Contacts(Tabular):
     """The contacts of a step between bodies a and b, and the impulses that acted in the step."""
 
@@ -158,7 +158,7 @@ class Contacts(Tabular):
         return np.einsum("ci,cij->cj", self.impulse, self.frame) / self.dt
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Frame:
     """A recorded step. The rows of the arrays are the bodies in the order of their ids: first the grains, then the
     large bodies."""
@@ -174,6 +174,10 @@ class Frame:
     lattice: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     drift: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     rate: np.ndarray = field(default_factory=lambda: np.zeros(3))  #: (3,) with which periods grew in the step [1/s]
+
+    def __repr__(self) -> str:
+        bodies, contacts = len(self.position), len(self.contacts)
+        return f"<Frame of step {self.step}, time {self.time:g} s: {bodies} bodies, {contacts} contacts>"
 
     @property
     def speed(self) -> np.ndarray:
@@ -217,6 +221,10 @@ class Folder:
         if not any((self.path / name).is_file() for name in ("settings.json", "steps.jsonl", "summary.json")):
             raise FileError(f"{path}: no output folder of python -m pctt.run (it has no steps.jsonl)")
         self.steps = sorted(int(path.stem) for path in self._frames.glob("*.h5") if path.stem.isdigit())
+
+    def __repr__(self) -> str:
+        steps = f", {self.steps[0]} to {self.steps[-1]}" if self.steps else ""
+        return f"<Folder {str(self.path)!r}: {len(self.steps)} recorded steps{steps}>"
 
     @property
     def _frames(self) -> Path:

@@ -129,7 +129,7 @@ def test_other_figures_than_those_of_a_checkpoint_are_told(tmp_path):
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.set_pair("glass", "default", friction=0.2)
     mass = 2 * 1500 * 4 / 3 * np.pi * 0.05**3
-    words = rf"friction 0.5, now 0.1, friction of glass with default 0.5, now 0.2, gravity z .* -9.81, now -1.62, "
+    words = r"friction 0.5, now 0.1, friction of glass with default 0.5, now 0.2, gravity z .* -9.81, now -1.62, "
     words += rf"mass of the grains .kg. {mass:.5g}, now {2 * mass:.5g}; gravity and laws of contact are those of now"
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", UserWarning)
