@@ -91,8 +91,15 @@ def made(group: type[Group], values: Mapping[str, Any]) -> Group:
     known = [f.name for f in dataclasses.fields(group)]  # type: ignore[arg-type]
     for name in values:
         if name not in known:
-            raise OptionError(f"{name}: no such setting; allowed are {', '.join(known)}{nearest(name, known)}")
+            meant = nearest(name, known) or _of_meaning(group, name.replace("_", ""))
+            raise OptionError(f"{name}: no such setting; allowed are {', '.join(known)}{meant}")
     return group(**values)
+
+
+def _of_meaning(group: Any, words: str) -> str:
+    """As of `nearest`, the setting whose meaning begins with these words without blanks."""
+    means = {f.name: f.metadata.get("help", "").replace(" ", "") for f in dataclasses.fields(group)}
+    return "".join(f"; did you mean {name}?" for name, text in means.items() if text.startswith(words))
 
 
 def refuse_bad(group: Any) -> None:

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from pctt.disk import whole
 from pctt.folder import Folder, Frame
 from pctt.look.program import View, checked, chosen, made_folder, parser, run, told_steps
-from pctt.options import POSITIVE, OptionError, made, refuse_bad
+from pctt.options import POSITIVE, OptionError, made, nearest, refuse_bad
 
 PALETTE = ["-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=none"]  # of a GIF, of its own colours
 SAMPLE = 12  # frames that decide the camera and the range of the colours
@@ -119,7 +119,7 @@ class Picture:
 def picture(folder: Folder, color: str, view: Mapping[str, Any]) -> Picture:
     """The first recorded step, seen as the fields of `pctt.look.program.View` say. OptionError for a bad one."""
     if color not in COLOURS:
-        raise OptionError(f"color {color!r}: allowed is one of {', '.join(COLOURS)}")
+        raise OptionError(f"color {color!r}: allowed is one of {', '.join(COLOURS)}{nearest(color, COLOURS)}")
     seen, frame = made(View, view), folder.frame(folder.steps[0])
     refuse_bad(seen)
     return _stage(folder, [frame], seen, color)(frame)

@@ -64,10 +64,11 @@ class Stage:
         own = view.colours([body["name"] for body in folder.large])
         hidden = {row for row, colour in own.items() if not colour[3]}
         self._window, self.scene, self.view = _window(view), surfaces.Scene(folder, frames, hidden), view
-        self._renderer = vtkRenderer(viewport=(0, 0, STAGE, 1), background=(1, 1, 1), use_fxaa=True)
+        self._renderer = vtkRenderer(background=(1, 1, 1), use_fxaa=True)
         self._renderer.SetUseDepthPeeling(min(view.opacity, *(colour[3] for colour in own.values()), 1.0) < 1)
         self._shade()
-        margin = vtkRenderer(viewport=(STAGE, 0, 1, 1), background=(1, 1, 1))
+        self._window.SetNumberOfLayers(2)
+        margin = vtkRenderer(viewport=(STAGE, 0, 1, 1), layer=1)  # over what goes on there of the floor
         for renderer in (self._renderer, margin):
             self._window.AddRenderer(renderer)
         vtkLightKit().AddLightsToRenderer(self._renderer)
@@ -171,6 +172,7 @@ class Stage:
         camera.SetFocalPoint(center)
         camera.SetPosition(center + distance / self.view.zoom * ahead)
         camera.SetViewUp(up)
+        camera.SetWindowCenter(1 - STAGE, 0)  # the scene is in the middle of its part of the width
 
 
 def _window(view: View) -> vtkRenderWindow:

@@ -99,6 +99,8 @@ def test_names_that_a_scene_does_not_have_are_refused():
         scene.add_body("b", [Box((1, 1, 1))], Dynamic(), dencity=1e3)
     with pytest.raises(OptionError, match="tolerance: no such setting; .*; did you mean tol?"):
         Simulation(scene, tolerance=1e-4)
+    with pytest.raises(OptionError, match="time_step: no such setting; .*; did you mean dt?"):
+        Simulation(scene, time_step=1e-4)
     with pytest.raises(AttributeError, match="module 'pctt' has no attribute 'Simulaton'; did you mean Simulation?"):
         pctt.Simulaton  # noqa: B018
 
@@ -142,6 +144,15 @@ def test_other_figures_than_those_of_a_checkpoint_are_told(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Simulation.load(tmp_path / "a.h5", falling(stiffness=1e5), dt=0.01)
+
+
+@pytest.mark.parallel(2)
+def test_overlaps_at_the_start_are_told_with_their_number_and_the_place_of_the_worst():
+    scene = falling()
+    scene.add_spheres([[0, 0, 0.38], [1, 0, 0.46], [5, 5, 0.05]], 0.05, 1500.0)
+    words = r"grain 1 and grain 3 overlap by 0.04 m at \(1, 0, 0.43\) m, 0.8 half.*, as at 1 other contacts. What helps"
+    with pytest.raises(OptionError, match=words):
+        Simulation(scene)
 
 
 def test_messages_speak_python(tmp_path):

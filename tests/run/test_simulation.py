@@ -521,7 +521,7 @@ def test_objects_say_what_they_are(tmp_path):
     shown += [Folder(tmp_path), Folder(tmp_path).frame(1), *(body.shapes[0] for body in scene.large_bodies)]
     for thing in shown:
         assert " object at 0x" not in repr(thing)
-        assert len(repr(thing)) < 250
+        assert len(repr(thing)) < 300
     assert "Mesh of 18 triangles" in repr(shown[-1])
     for grains_or_contacts in (sim.contacts, sim.local):
         columns = dict(grains_or_contacts)
