@@ -251,7 +251,7 @@ class Folder:
     def require_frames(self) -> None:
         """Read the shapes of the bodies; FileError if these, or recorded steps, are missing."""
         if not self.steps:
-            raise FileError(f"{self.path}: no recorded steps; output_every, in Python every, must be 1 or more")
+            raise FileError(f"{self.path}: no recorded steps; -output_every, or write(every=...), makes them")
 
         def take(file: h5py.File) -> list[Any]:
             same_rows(file, TABLE[1:])
