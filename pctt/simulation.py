@@ -515,8 +515,8 @@ class Simulation:
     def render(self, color: str = "speed", **view: Any) -> Picture:
         """A picture of the present state, which a notebook shows and ``save`` writes. ``color`` is one of
         `pctt.render.COLOURS`; what else may be given are fields of `pctt.look.program.View`, such as azimuth=30.0
-        and bodies={"blade": "orange", "box": "none"}. ImportError without VTK (the extra `pictures`), OptionError for a bad
-        name or value."""
+        and bodies={"blade": "orange", "box": "none"}. ImportError without VTK (the extra `pictures`), OptionError for a
+        bad name or value."""
         snapshot = self._snapshot()
 
         def draw() -> Picture | None:
