@@ -51,9 +51,18 @@ class Rule:
             yield first, self[first : first + self.CHUNK]
 
 
+def frozen(array: np.ndarray) -> np.ndarray:
+    """The array, which nobody can write to from now on."""
+    array.flags.writeable = False
+    return array
+
+
 class Tabular:
     """A table whose fields are arrays (n,) or (n, parts): ``dict(table)`` has a column (n,) for each part, and so has
     ``pandas.DataFrame(dict(table))``."""
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {len(next(iter(self.flat().values())))} rows of {', '.join(self.keys())}>"
 
     def keys(self) -> list[str]:
         """The names of the columns."""

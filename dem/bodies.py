@@ -25,7 +25,7 @@ FORM = 6
 CLUMP, POLYHEDRON, CONVEX = FORM, 1 << 20, 1 << 21
 
 
-@dataclass
+@dataclass(repr=False)
 class Bodies(Tabular):
     """Rigid bodies as a struct of arrays; all vectors in the world frame, SI units.
 

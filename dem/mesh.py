@@ -205,7 +205,7 @@ def spread(start: Ints, of: Ints) -> tuple[Ints, Ints]:
     return row, np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + start[of][row]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Mesh:
     """Triangles in space, which spheres and capsules touch from both sides. With a density the surface must be closed,
     its normals outwards."""
@@ -235,6 +235,10 @@ class Mesh:
         object.__setattr__(self, "triangles", row.reshape(-1, 3))
         object.__setattr__(self, "surface", Surface(vertices[used], row.reshape(-1, 3)))
         check_fields(self, center=vector, quaternion=unit_quaternion)
+
+    def __repr__(self) -> str:
+        size = " x ".join(f"{length:.4g}" for length in np.ptp(self.surface.vertex, axis=0))
+        return f"<Mesh of {len(self.surface.triangle)} triangles, {size} m, at {tuple(self.center)}>"
 
     def solid(self) -> tuple[float, Floats, Floats]:
         """Volume [m^3], centre of mass (3,) and inertia tensor (3, 3) about it at density one, in the frame of the

@@ -217,6 +217,7 @@ class Rotation(Timed):
         check_fields(self, velocity=vector, center=vector)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
+        """As of `Fixed`."""
         turn = quaternion.exponential(self.gone(time) * np.array(self.velocity))
         center = np.array(self.center)
         turned = quaternion.normalized(quaternion.multiply(turn, orientation))
@@ -240,6 +241,7 @@ class Oscillation(Timed):
         check_fields(self, direction=unit_vector, amplitude=finite, period=positive, phase=finite)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
+        """As of `Fixed`."""
         angle = 2.0 * np.pi * self.gone(time) / self.period
         swing = np.sin(angle + self.phase) - np.sin(self.phase)
         return position + self.amplitude * swing * np.array(self.direction), orientation
@@ -258,6 +260,7 @@ class Glide(Timed):
         check_fields(self, velocity=vector)
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
+        """As of `Fixed`."""
         return position + self.gone(time) * np.array(self.velocity), orientation
 
 
@@ -300,6 +303,7 @@ class Path:
             raise ValueError(f"{file}: {error}") from None
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
+        """As of `Fixed`."""
         places = np.array(self.positions)
         place = np.array([np.interp(time, self.times, axis) for axis in places.T])
         return position + place - places[0], orientation

@@ -15,14 +15,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, TypeVar, Union
+from functools import partial, wraps
+from inspect import Parameter, signature
+from typing import Any, TypeVar, Union, cast
 
 import numpy as np
 from mpi4py import MPI
 
 from dem import bodies, checks, quaternion, shapes
-from dem.arrays import ArrayLike, Floats, Ints, Rule
+from dem.arrays import ArrayLike, Floats, Ints, Rule, frozen
 from dem.bodies import BOX, CAPSULE, COMPOUND, PLANE, SPHERE, Bodies
 from dem.geometry.survey import Survey, survey
 from dem.measures import Block, Cylinder
@@ -147,8 +148,28 @@ class Part:
         )
 
 
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def _building(method: Method) -> Method:
+    """A method that adds to a scene, or changes it: ValueError once a simulation has the scene, TypeError for an
+    argument that it does not have."""
+    known = {name: each.kind for name, each in list(signature(method).parameters.items())[1:]}
+
+    @wraps(method)
+    def checked(scene: Scene, *given: Any, **named: Any) -> Any:
+        scene.refuse_finished(method.__name__)
+        for name in set() if Parameter.VAR_KEYWORD in known.values() else named.keys() - known:
+            there = f"allowed are {', '.join(known)}{checks.nearest(name, known)}"
+            raise TypeError(f"{method.__name__}: there is no argument {name!r}; {there}")
+        return method(scene, *given, **named)
+
+    return cast(Method, checked)
+
+
 class Scene:
-    """Collects grains, large bodies, materials and gravity; checks each as it comes (ValueError)."""
+    """Collects grains, large bodies, materials and gravity; checks each as it comes (ValueError). A scene of which a
+    simulation was made stays as it is; `copy.deepcopy` makes one that can be changed."""
 
     def __init__(
         self,
@@ -186,6 +207,34 @@ class Scene:
         self.forms: list[Form] = []  #: the distinct shapes of clumps and polyhedra, see `dem.bodies`
         self.named = no_parts()  #: loads, springs, joints and sources by kind and name, see `KINDS`
         self.passages = Passages(self.named["source"])  #: sources and outlets
+        self._finished = False
+
+    def finish(self) -> None:
+        """Refuse changes from now on: a simulation that has the scene would not see them."""
+        if not self._finished:
+            self.gravity = frozen(self.gravity.copy())
+        self._finished = True
+
+    def refuse_finished(self, what: str) -> None:
+        """ValueError for a change once the scene is finished."""
+        if self._finished:
+            allowed = "allowed are a copy.deepcopy(scene) for another one, and change(...) of the simulation"
+            raise ValueError(f"{what}: a simulation was made of this scene, and would not see the change; {allowed}")
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """AttributeError for a name that a scene does not have, ValueError as of `refuse_finished`."""
+        if (known := vars(self)).get("_finished") is not None and not name.startswith("_"):
+            if name not in known:
+                raise AttributeError(f"a Scene has no {name!r} to set{checks.nearest(name, known)}")
+            self.refuse_finished(name)
+        super().__setattr__(name, value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies, which can be changed."""
+        return {**vars(self), "_finished": False}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        vars(self).update(kept, gravity=np.array(kept["gravity"]))
 
     def __repr__(self) -> str:
         parts = [f"{self.count} grains", f"{len(self.large_bodies)} large bodies"]
@@ -193,6 +242,7 @@ class Scene:
         parts += [f"{len(members)} {kind}s" for kind, members in self.named.items() if members]
         return f"<Scene: {'; '.join(parts)}; friction {self._law.friction:g}>"
 
+    @_building
     def add_spheres(
         self,
         positions: ArrayLike,
@@ -212,6 +262,7 @@ class Scene:
         upright, lengths = (1.0, 0.0, 0.0, 0.0), {"radius": radius}
         return self._add_grains(SPHERE, positions, lengths, density, material, upright, velocity, angular_velocity)
 
+    @_building
     def add_boxes(
         self,
         positions: ArrayLike,
@@ -231,6 +282,7 @@ class Scene:
         lengths = {"half extents": half_extents}
         return self._add_grains(BOX, positions, lengths, density, material, quaternions, velocity, angular_velocity)
 
+    @_building
     def add_capsules(
         self,
         positions: ArrayLike,
@@ -251,6 +303,7 @@ class Scene:
         lengths = {"radius": radius, "half length": half_length}
         return self._add_grains(CAPSULE, positions, lengths, density, material, quaternions, velocity, angular_velocity)
 
+    @_building
     def add_clumps(
         self,
         positions: ArrayLike,
@@ -271,6 +324,7 @@ class Scene:
         form = clumps.form(shape)
         return self._add_form(form, positions, density, 1.0, quaternions, material, velocity, angular_velocity)
 
+    @_building
     def add_polyhedra(
         self,
         positions: ArrayLike,
@@ -295,6 +349,7 @@ class Scene:
         form = polyhedra.solid(vertices)
         return self._add_form(form, positions, density, scale, quaternions, material, velocity, angular_velocity)
 
+    @_building
     def add_grains(
         self,
         positions: ArrayLike,
@@ -316,6 +371,7 @@ class Scene:
         form = convex.form(shape)
         return self._add_form(form, positions, density, scale, quaternions, material, velocity, angular_velocity)
 
+    @_building
     def add_body(
         self,
         name: str,
@@ -374,6 +430,7 @@ class Scene:
                 self._know(convex.centred(shape))
         self.large_bodies.append(replace(body, material=self._material(material)))
 
+    @_building
     def add_load(
         self,
         name: str,
@@ -393,6 +450,7 @@ class Scene:
             raise ValueError(f"loads need names that no other load and no large body has, got {name!r}")
         self.named["load"][name] = Load(on, force, torque, start, end)
 
+    @_building
     def add_spring(
         self,
         name: str,
@@ -417,6 +475,7 @@ class Scene:
         rest = float(np.linalg.norm(spring.vector(f"spring {name!r}", self)))
         self.named["spring"][name] = spring if length is not None else replace(spring, length=rest)
 
+    @_building
     def add_joint(
         self,
         name: str,
@@ -463,11 +522,13 @@ class Scene:
         """The table of one grain at time zero."""
         return self._rows(id, id + 1)
 
+    @_building
     def add_source(self, name: str, region: Block | Cylinder, *, material: str = "default", **given: Any) -> None:
         """Let grains come in a region of `dem.measures`, where there is room; `given` are the fields of
         `dem.parts.sources.Source`: radius [m], density [kg/m^3], mass_rate [kg/s] or number_rate [1/s], and others."""
         self.passages.add(name, Source(region, material=self._material(material), **given))
 
+    @_building
     def add_outlet(self, name: str, region: Block | Cylinder, *, outside: bool = False) -> None:
         """Let grains leave whose centres are in a region of `dem.measures`; `outside`: those that are not in it."""
         self.passages.add(name, Outlet(region, outside))
@@ -514,6 +575,7 @@ class Scene:
         size = np.outer(radius[rows], [1.0, 0.0, 0.0])
         return replace(self.large().take(rows), shape=np.full(len(rows), SPHERE), size=size)
 
+    @_building
     def set_pair(self, material: str, other: str, **law: float | None) -> None:
         """Coefficients of the contacts of two materials (which may be the same one), the fields of
         `dem.parts.contact_law.ContactLaw`; those not given stay as they are. ValueError for a bad one."""
@@ -538,6 +600,19 @@ class Scene:
             radius = float(bodies.bounding_radius(self.survey().extremes).max())
             found += dict.fromkeys(law.doubt(radius) for law in (self._law, *self._pairs.values()))
         return "; ".join(filter(None, found))
+
+    def figures(self) -> dict[str, str]:
+        """What tells the scene from others with as many bodies, to five digits: gravity, coefficients of contact,
+        masses, sizes, materials."""
+        laws = {"": self._law}
+        laws |= {f" of {self.materials[a]} with {self.materials[b]}": law for (a, b), law in self._pairs.items()}
+        found = {name + pair: value for pair, law in laws.items() for name, value in vars(law).items()
+                 if not pair or value != vars(self._law)[name]}  # fmt: skip
+        found |= {f"gravity {axis} [m/s^2]": value for axis, value in zip("xyz", self.gravity)}
+        found |= {"mass of the grains [kg]": self.survey().mass, "sum of their radii [m]": self.survey().radius}
+        found |= {f"mass of {body.name} [kg]": body.mass for body in self.large_bodies}
+        numbers = {name: f"{value:.5g}" for name, value in found.items() if value is not None}
+        return numbers | {f"material of {body.name}": self.materials[body.material] for body in self.large_bodies}
 
     def pairs(self, stiffness: float) -> ContactLaw:
         """The tables of all pairs of materials, with this `stiffness` [N/m] where none is stated."""

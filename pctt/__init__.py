@@ -71,7 +71,9 @@ __all__ = sorted(_HOME)  # noqa: PLE0605
 
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
-        raise AttributeError(f"module 'pctt' has no attribute {name!r}")
+        from dem.checks import nearest
+
+        raise AttributeError(f"module 'pctt' has no attribute {name!r}{nearest(name, __all__)}")
     home = import_module(_HOME[name])
     return import_module("dem.measures") if name == "measures" else getattr(home, name)
 

@@ -119,7 +119,7 @@ def totals(steps: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 # -- reading -------------------------------------------------------------------------------------------------
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Contacts(Tabular):
     """The contacts of a step between bodies a and b, and the impulses that acted in the step."""
 
@@ -158,7 +158,7 @@ class Contacts(Tabular):
         return np.einsum("ci,cij->cj", self.impulse, self.frame) / self.dt
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Frame:
     """A recorded step. The rows of the arrays are the bodies in the order of their ids: first the grains, then the
     large bodies."""
@@ -174,6 +174,10 @@ class Frame:
     lattice: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     drift: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     rate: np.ndarray = field(default_factory=lambda: np.zeros(3))  #: (3,) with which periods grew in the step [1/s]
+
+    def __repr__(self) -> str:
+        bodies, contacts = len(self.position), len(self.contacts)
+        return f"<Frame of step {self.step}, time {self.time:g} s: {bodies} bodies, {contacts} contacts>"
 
     @property
     def speed(self) -> np.ndarray:
@@ -213,10 +217,14 @@ class Folder:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         if not self.path.is_dir():
-            raise FileError(f"{path}: no such folder; it is the -output of python -m pctt.run")
+            raise FileError(f"{path}: no such folder of a run")
         if not any((self.path / name).is_file() for name in ("settings.json", "steps.jsonl", "summary.json")):
             raise FileError(f"{path}: no output folder of python -m pctt.run (it has no steps.jsonl)")
         self.steps = sorted(int(path.stem) for path in self._frames.glob("*.h5") if path.stem.isdigit())
+
+    def __repr__(self) -> str:
+        steps = f", {self.steps[0]} to {self.steps[-1]}" if self.steps else ""
+        return f"<Folder {str(self.path)!r}: {len(self.steps)} recorded steps{steps}>"
 
     @property
     def _frames(self) -> Path:
@@ -243,7 +251,7 @@ class Folder:
     def require_frames(self) -> None:
         """Read the shapes of the bodies; FileError if these, or recorded steps, are missing."""
         if not self.steps:
-            raise FileError(f"{self.path}: no recorded steps; run with -output_every 1 or more")
+            raise FileError(f"{self.path}: no recorded steps; -output_every, or write(every=...), makes them")
 
         def take(file: h5py.File) -> list[Any]:
             same_rows(file, TABLE[1:])

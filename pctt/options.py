@@ -91,8 +91,15 @@ def made(group: type[Group], values: Mapping[str, Any]) -> Group:
     known = [f.name for f in dataclasses.fields(group)]  # type: ignore[arg-type]
     for name in values:
         if name not in known:
-            raise OptionError(f"{name}: no such setting; allowed are {', '.join(known)}{nearest(name, known)}")
+            meant = nearest(name, known) or _of_meaning(group, name.replace("_", ""))
+            raise OptionError(f"{name}: no such setting; allowed are {', '.join(known)}{meant}")
     return group(**values)
+
+
+def _of_meaning(group: Any, words: str) -> str:
+    """As of `nearest`, the setting whose meaning begins with these words without blanks."""
+    means = {f.name: f.metadata.get("help", "").replace(" ", "") for f in dataclasses.fields(group)}
+    return "".join(f"; did you mean {name}?" for name, text in means.items() if text.startswith(words))
 
 
 def refuse_bad(group: Any) -> None:
@@ -111,9 +118,9 @@ _TYPES: dict[Any, type] = {int: numbers.Integral, float: numbers.Real, bool: boo
 
 
 def _kind(hint: Any) -> Any:
-    """The X of Optional[X], or of any other X."""
-    inner = [kind for kind in typing.get_args(hint) if kind is not type(None)]
-    return inner[0] if inner else hint
+    """The X of Optional[X]; of any other hint itself."""
+    kinds = typing.get_args(hint)
+    return next(kind for kind in kinds if kind is not type(None)) if type(None) in kinds else hint
 
 
 def _allowed(kind: Any, metadata: Mapping[str, Any]) -> str:

@@ -17,11 +17,12 @@ from mpi4py import MPI
 from pctt.disk import whole
 from pctt.folder import Folder, Frame
 from pctt.look.program import View, checked, chosen, made_folder, parser, run, told_steps
-from pctt.options import POSITIVE, OptionError, made, refuse_bad
+from pctt.options import POSITIVE, OptionError, made, nearest, refuse_bad
 
 PALETTE = ["-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=none"]  # of a GIF, of its own colours
 SAMPLE = 12  # frames that decide the camera and the range of the colours
 SIZE = ("WIDTHxHEIGHT with even numbers from 32, such as 1280x960", lambda size: not any(n < 32 or n % 2 for n in size))
+BODIES = "colours of large bodies, as matplotlib knows them, such as blade=orange,box=none; none: not shown"
 # title of the colour bar, colour map, part of the map that is used
 COLOURS: dict[str, tuple[str, str, tuple[float, float]]] = {
     "speed": ("speed\n[m/s]", "viridis", (0.12, 1.0)),
@@ -39,6 +40,7 @@ def arguments() -> tuple[argparse.Namespace, View]:
     line.add_argument("-range", type=float, nargs=2, metavar=("LOW", "HIGH"), help="of the colours; without: from data")
     for field in fields(View)[:4]:
         line.add_argument(f"-{field.name}", type=float, default=field.default, help=field.metadata["help"])
+    line.add_argument("-bodies", type=_bodies, default={}, metavar="NAME=COLOR,...", help=BODIES)
     line.add_argument("-cut", action="store_true", help=fields(View)[4].metadata["help"])
     line.add_argument("-size", type=checked(_size, SIZE), default="1280x960", metavar="WxH", help="in pixels")
     line.add_argument("-film", choices=("mp4", "gif", "none"), default="mp4", help="film of several pictures")
@@ -47,12 +49,23 @@ def arguments() -> tuple[argparse.Namespace, View]:
     if given.range and (given.color == "material" or not given.range[0] < given.range[1]):
         low, high = given.range
         line.error(f"-range {low:g} {high:g}: allowed are two numbers that rise, and not with -color material")
-    view = View(given.azimuth, given.elevation, given.zoom, given.opacity, given.cut, *given.size)
+    width, height = given.size
+    view = View(
+        given.azimuth, given.elevation, given.zoom, given.opacity, given.cut, width, height, given.bodies
+    )  # fmt: skip
     try:
         refuse_bad(view)
     except OptionError as error:
         line.error(f"-{error}")
     return given, view
+
+
+def _bodies(text: str) -> dict[str, str]:
+    pairs = [pair.partition("=") for pair in text.split(",")]
+    for name, _, colour in pairs:
+        if not (name and colour):
+            raise argparse.ArgumentTypeError(f"{text}: allowed is NAME=COLOR, and more behind commas")
+    return {name: colour for name, _, colour in pairs}
 
 
 def _size(text: str) -> tuple[int, ...]:
@@ -106,7 +119,7 @@ class Picture:
 def picture(folder: Folder, color: str, view: Mapping[str, Any]) -> Picture:
     """The first recorded step, seen as the fields of `pctt.look.program.View` say. OptionError for a bad one."""
     if color not in COLOURS:
-        raise OptionError(f"color {color!r}: allowed is one of {', '.join(COLOURS)}")
+        raise OptionError(f"color {color!r}: allowed is one of {', '.join(COLOURS)}{nearest(color, COLOURS)}")
     seen, frame = made(View, view), folder.frame(folder.steps[0])
     refuse_bad(seen)
     return _stage(folder, [frame], seen, color)(frame)

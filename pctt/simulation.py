@@ -7,7 +7,8 @@
     print(sim.time, sim.positions, sim.body("paddle").force)
 
 ``python -m pctt.run`` does nothing else. On several ranks every rank makes the same calls; all members are collective
-that do not say otherwise. Quantities are in SI units.
+that do not say otherwise. Quantities are in SI units. Arrays cannot be written to: they are what is, and `change` and
+motions say what is to be.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from mpi4py import MPI
 
 from dem import measures
 from dem import record as recording
-from dem.arrays import Floats
+from dem.arrays import Floats, frozen
 from dem.bodies import Bodies
 from dem.experiment import Experiment, Given
 from dem.measures import Sample
@@ -116,9 +117,9 @@ class Simulation:
         if isinstance(restart, state.Kept):
             self.world, self.memory = state.restored(restart, scene, comm)
         elif restart:
-            self.world, self.memory = state.load(Path(restart), scene, self._origin, comm)
+            self.world, self.memory = state.load(Path(restart), scene, self._origin, comm, program)
         else:
-            self.world = state.world_at_start(self.experiment, self.settings, scene, comm)
+            self.world = state.world_at_start(self.experiment, self.settings, scene, comm, program)
             self.memory = ImpulseMemory(comm, self.world.pairs.parts, self.world.pairs.columns)
         falls = "" if restart else comm.bcast(fall_remark(scene, self.settings.dt))
         if large := step_remark(self.world, self.settings.dt) or falls:
@@ -139,6 +140,7 @@ class Simulation:
         self.output: Writer | None = None
         self._closed = False
         self._known = {"_known", "_row", *vars(self)}
+        scene.finish()
 
     def __setattr__(self, name: str, value: object) -> None:
         """AttributeError for a name that a simulation does not have: it would do nothing."""
@@ -239,9 +241,11 @@ class Simulation:
         stop: Callable[[Simulation], bool] | None = None,
         every: int = 1,
         call: Callable[[Simulation], object] | None = None,
+        progress: bool = False,
     ) -> None:
         """Make steps until the time ``until`` [s], or so many ``steps``, or until ``stop(self)`` is true after one,
-        whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`."""
+        whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`.
+        ``progress``: say where it is, and how long it goes on."""
         if bare:
             says = ", ".join(map(repr, bare))
             raise OptionError(f"run({says}): steps or seconds? allowed is run(steps={says}), or run(until={says}) [s]")
@@ -254,6 +258,8 @@ class Simulation:
         if until is not None:
             left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
         first, end, ends = self.steps, self.steps + left, False
+        told = report.Progress(self.comm, quiet=not progress)
+        told.passed(first, self.time, end)
 
         def tell() -> bool:
             if call is not None and (self.steps - first) % every == 0:
@@ -266,6 +272,7 @@ class Simulation:
                 ends = tell()
             elif call or stop:  # an error of one rank is one of all, and the first rank decides
                 ends = self.comm.bcast(together(self.comm, "call or stop of run", tell))
+            told.passed(self.steps, self.time, self.steps if ends else end)
         self.complete()
 
     # -- what there is ---------------------------------------------------------------------------------------
@@ -322,12 +329,12 @@ class Simulation:
     def local(self) -> Bodies:
         """The grains of this rank, a table with the columns ``id``, ``position``, ``velocity`` and so on, in any order;
         ``id`` is the number in the order of the scene. Not collective."""
-        return self.world.grains
+        return Bodies(**{name: frozen(column.view()) for name, column in self.world.grains.columns().items()})
 
     def _of_grains(self, name: str) -> np.ndarray:
         grains = self.world.cell.inside(self.world.grains)
         found = self._gathered(name, id=grains.id, values=getattr(grains, name))
-        return found["values"][np.argsort(found["id"])]
+        return frozen(found["values"][np.argsort(found["id"])])
 
     def _gathered(self, what: str, **columns: np.ndarray) -> dict[str, np.ndarray]:
         """The rows of all ranks, on every rank."""
@@ -360,7 +367,7 @@ class Simulation:
             **({} if step.moments is None else {"moment": step.moments}),
         )
         order = np.argsort(found.pop("key"))
-        return Contacts(**{name: column[order] for name, column in found.items()}, dt=step.system.dt)
+        return Contacts(**{name: frozen(column[order]) for name, column in found.items()}, dt=step.system.dt)
 
     @property
     def sample(self) -> Sample:
@@ -401,7 +408,7 @@ class Simulation:
         """The lengths (3,) of the periodic cell now [m], inf: none along that axis; None: no axis has one. Not
         collective."""
         cell = self.world.cell
-        return cell.period.copy() if cell.periodic else None
+        return frozen(cell.period.copy()) if cell.periodic else None
 
     @property
     def springs(self) -> dict[str, Spring]:
@@ -427,7 +434,7 @@ class Simulation:
     # -- files -----------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Keep the state in a checkpoint, from which `load` and ``-restart`` go on. FileError if that fails."""
+        """Keep the state in a checkpoint, from which `load` goes on. FileError if that fails."""
         refuse_unwritable("save", Path(path).parent, self.comm)
         self._save(Path(path))
 
@@ -459,7 +466,7 @@ class Simulation:
         for name, path in {"write": folder, "problems": problems}.items():
             if path:
                 refuse_unwritable(name, Path(path), self.comm)
-        place = Place(Path(folder), self.comm, self.restart, overwrite)
+        place = Place(Path(folder), self.comm, self.restart, overwrite, self._program)
         about = {"scene": json.loads(self._origin["scene"]), "settings": dataclasses.asdict(self.settings)}
         about["stiffness"] = self.world.pairs.stiffness.tolist()
         self.output = Writer(place, self.world, about, self._save, self._compare.summary, run)
@@ -507,8 +514,9 @@ class Simulation:
 
     def render(self, color: str = "speed", **view: Any) -> Picture:
         """A picture of the present state, which a notebook shows and ``save`` writes. ``color`` is one of
-        `pctt.render.COLOURS`; what else may be given are fields of `pctt.look.program.View`, such as azimuth=30.0.
-        ImportError without VTK (the extra `pictures`), OptionError for a bad name or value."""
+        `pctt.render.COLOURS`; what else may be given are fields of `pctt.look.program.View`, such as azimuth=30.0
+        and bodies={"blade": "orange", "box": "none"}. ImportError without VTK (the extra `pictures`), OptionError for a
+        bad name or value."""
         snapshot = self._snapshot()
 
         def draw() -> Picture | None:
@@ -559,17 +567,17 @@ class Body:
     @property
     def position(self) -> Floats:
         """Centre of mass (3,); of a body with prescribed motion its reference point [m]."""
-        return self._sim.world.large.position[self._row].copy()
+        return frozen(self._sim.world.large.position[self._row].copy())
 
     @property
     def orientation(self) -> Floats:
         """Quaternion (4,) (w, x, y, z)."""
-        return self._sim.world.large.quaternion[self._row].copy()
+        return frozen(self._sim.world.large.quaternion[self._row].copy())
 
     @property
     def velocity(self) -> Floats:
         """Linear and angular velocity (6,) in the last step [m/s, rad/s]."""
-        return self._sim.world.large.velocity[self._row].copy()
+        return frozen(self._sim.world.large.velocity[self._row].copy())
 
     @property
     def force(self) -> Floats:

@@ -18,8 +18,9 @@ from petsc4py import PETSc
 from dem.experiment import from_file
 from dem.parts.contact_law import ContactLaw
 from dem.parts.sources import Source
-from pctt import ccp
+from pctt import Folder, Simulation, ccp
 from pctt.ccp import fclib
+from pctt.render import Picture
 from pctt.run.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,12 +47,19 @@ def in_folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_scene_of_the_readme_is_one(in_folder):
-    (in_folder / "column.py").write_text(blocks("README.md")[0])
-    scene = from_file(in_folder / "column.py")(n=2).build()
-    assert len(scene.grains()) == 24
-    assert scene.grains().position.min() > 0.1  # no sphere touches the floor at the start
-    assert [body.name for body in scene.large_bodies] == ["floor"]
+def test_the_column_of_the_readme_spreads_on_its_floor(in_folder, monkeypatch):
+    names: dict[str, Any] = {}
+    monkeypatch.setattr(Simulation, "render", lambda sim, color: Picture(np.zeros((2, 2, 3), np.uint8)))
+    monkeypatch.setattr(Picture, "save", lambda picture, path: Path(path).write_bytes(b""))  # may lack what draws
+    exec(blocks("README.md")[0], names)
+    sim, before = names["sim"], names["centres"]
+    assert len(blocks("README.md")[0].split("\n\n")) == 3
+    assert sim.time == pytest.approx(2.0, abs=sim.settings.dt)
+    assert sim.positions[:, 2].min() > 0.099
+    assert sim.positions[:, 2].max() < 0.5 * before[:, 2].max()
+    assert np.ptp(sim.positions[:, 0]) > 2 * np.ptp(before[:, 0])
+    assert len(Folder("column").steps) >= sim.steps // 4
+    assert Path("column.png").exists()
 
 
 def test_the_measures_of_their_page_are_those_of_a_lattice(in_folder, capsys):

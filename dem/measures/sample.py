@@ -14,7 +14,7 @@ from dem.measures.images import images
 from dem.shapes import solid
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sample:
     """The grains (n) and contacts (nc) of this rank: grains as they are now, contacts as of the step that led there."""
 
@@ -38,6 +38,9 @@ class Sample:
     #: (3, 3) the ways to the next images along each axis [m], and their velocities [m/s]; 0: no period
     lattice: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     drift: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def __repr__(self) -> str:
+        return f"<Sample of this rank: {len(self.id)} grains, {len(self.gap)} contacts>"
 
     def of(self, material: str) -> Bools:
         """Mask (n,) of the grains of a material; ValueError if there is none of that name."""

@@ -27,7 +27,7 @@ STATE = (
 )  # fmt: skip
 
 
-@dataclass
+@dataclass(repr=False)
 class World:
     """Bodies, materials and time.
 
@@ -101,6 +101,9 @@ class World:
     def ids(self) -> int:
         """Number of grains that there have been; their ids are less."""
         return self.initial + self.passages.came
+
+    def __repr__(self) -> str:
+        return f"<World: {self.body_count} bodies, {len(self.grains)} grains of this rank, time {self.time:g} s>"
 
     @property
     def body_count(self) -> int:

@@ -41,6 +41,7 @@ class Uniform:
 
     @property
     def ends(self) -> tuple[float, float]:
+        """The least and the greatest size [m]."""
         return self.low, self.high
 
     def at(self, share: Floats) -> Floats:
@@ -65,6 +66,7 @@ class Listed:
 
     @property
     def ends(self) -> tuple[float, float]:
+        """The least and the greatest size [m]."""
         return min(self.values), max(self.values)
 
     def at(self, share: Floats) -> Floats:

@@ -44,7 +44,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Sphere:
-    """Ball."""
+    """A ball about its centre, as a shape of a large body; grains come by `Scene.add_spheres`."""
 
     radius: float  #: [m]
     center: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) [m]

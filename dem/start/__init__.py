@@ -152,14 +152,14 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
 
 
 def refuse_overlap(world: World, overlap: float) -> None:
-    """ValueError, on all ranks, that names the worst pair if bodies overlap by more than `overlap` half thicknesses of
-    the thinner one that forces move.
+    """ValueError, on all ranks, that names the worst pair, its place and the number of such contacts, if bodies overlap
+    by more than `overlap` half thicknesses of the thinner one that forces move.
 
     Bodies at the ends of a part that do not touch each other may share a place, and so may those that no force can part
     (`held_overlap`)."""
     contacts = find_contacts(world, 0.0)
     table = contacts.near.bodies
-    worst = (0.0, 0.0, -1, -1)
+    worst, many = (0.0, 0.0, -1, -1, [0.0] * 3), 0
     if len(contacts):
         half, large = bodies.least_half_thickness(table), table.shape == bodies.COMPOUND
         moves = bodies.is_dynamic(world.large)
@@ -167,12 +167,14 @@ def refuse_overlap(world: World, overlap: float) -> None:
         relative = -contacts.gap / np.minimum(half[contacts.a], half[contacts.b])
         pair = np.stack([table.id[contacts.a], table.id[contacts.b]], axis=1)
         c = int(np.argmax(relative))
-        worst = (float(relative[c]), float(-contacts.gap[c]), int(pair[c, 0]), int(pair[c, 1]))
-    relative_depth, depth, a, b = world.comm.allreduce(worst, MPI.MAX)
+        many, place = int(np.count_nonzero(relative > overlap)), contacts.point[c].tolist()
+        worst = (float(relative[c]), float(-contacts.gap[c]), int(pair[c, 0]), int(pair[c, 1]), place)
+    relative_depth, depth, a, b, place = world.comm.allreduce(worst, MPI.MAX)
     if relative_depth > overlap:
-        pair = f"{world.name_of(a)} and {world.name_of(b)} overlap by {depth:g} m"
+        more, at = world.comm.allreduce(many) - 1, ", ".join(f"{x:.4g}" for x in place)
+        pair = f"{world.name_of(a)} and {world.name_of(b)} overlap by {depth:g} m at ({at}) m"
         most = f"{relative_depth:.2g} half thicknesses, where {overlap:g} are allowed"
-        raise ValueError(f"overlapping start: {pair}, {most}")
+        raise ValueError(f"overlapping start: {pair}, {most}{f', as at {more} other contacts' if more else ''}")
 
 
 def step_remark(world: World, dt: float) -> str:

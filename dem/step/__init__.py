@@ -29,7 +29,7 @@ from dem.unconstrained import UnconstrainedMotion, large_velocity
 ALIKE, NEAR = 0.99, 10.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Step:
     """A step that was just made, with its forces, places and sums: the argument of a scene's `record`.
 
@@ -41,6 +41,9 @@ class Step:
     system: ContactSystem
     impulse: Floats  #: (nc, 3) of the local contacts: normal, t1, t2; with their attraction [N s]
     moment: Floats | None = None  #: (nc, 3) about normal, t1, t2, over `Resistance.length`; None without [N s]
+
+    def __repr__(self) -> str:
+        return f"<Step to {self.world.time:g} s: {len(self.impulse)} contacts of this rank>"
 
     def force_on(self, name: str) -> Floats:
         """Contact force and torque (6,) [N, N m] on a large body, about its reference point, averaged over the step."""

@@ -6,8 +6,8 @@ import argparse
 import math
 import sys
 import traceback
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from pctt.disk import FileError, told
 from pctt.folder import Folder
-from pctt.options import AT_LEAST_ONE, POSITIVE, option
+from pctt.options import AT_LEAST_ONE, POSITIVE, OptionError, nearest, option
 
 LIBRARIES = ("matplotlib", "vtkmodules", "PIL", "imageio_ffmpeg")
 EXTRA = "the extra `pictures` has the libraries that draw: pip install 'pctt[pictures]', in a checkout -e '.[pictures]'"
@@ -37,6 +37,26 @@ class View:
     cut: bool = option(False, "leave out the grains in the half nearer to the camera")
     width: int = option(1280, "of a picture [pixels]", check=PIXELS)
     height: int = option(960, "of a picture [pixels]", check=PIXELS)
+    #: colours of large bodies by their names, as matplotlib knows them, such as {"blade": "orange", "box": "none"};
+    #: their alpha is the opacity, and what is not seen at all, such as "none", does not count for the camera either
+    bodies: Mapping[str, Any] = field(default_factory=dict)
+
+    def colours(self, names: Sequence[str]) -> dict[int, tuple[float, float, float, float]]:
+        """The colours (red, green, blue, alpha) of `bodies` by their places in ``names``; OptionError for a name that
+        is not there, and for what is no colour."""
+        from matplotlib.colors import to_rgba  # imported here, because -help does not need it
+
+        found = {}
+        for name, colour in self.bodies.items():
+            if name not in names:
+                there = f"allowed is one of {', '.join(names) or 'none'}"
+                raise OptionError(f"bodies: there is no large body {name!r}; {there}{nearest(name, names)}")
+            try:
+                found[names.index(name)] = to_rgba(colour)
+            except ValueError:
+                allowed = "allowed is one that matplotlib knows, such as orange, #ff8800, #ff880080, none"
+                raise OptionError(f"bodies: the colour {colour!r} of {name!r}; {allowed}") from None
+        return found
 
 
 def parser(program: str, text: str, folder: str = "", steps: bool = True) -> argparse.ArgumentParser:
@@ -102,7 +122,7 @@ def run(main: Callable[[MPI.Comm], None], program: str) -> int:
     comm = MPI.COMM_WORLD
     try:
         main(comm)
-    except FileError as error:
+    except (FileError, OptionError) as error:
         print(f"pctt.{program}: {error}", file=sys.stderr, flush=True)
         if comm.size > 1:  # the error may be on this rank only
             comm.Abort(2)

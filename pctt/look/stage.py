@@ -39,6 +39,7 @@ from pctt.look.program import View
 
 INK = (0.1, 0.1, 0.1)
 STAGE = 0.86  # part of the width for the scene; the rest is for the colour bar
+REACH = 0.06  # how far bodies darken each other, in diagonals of the scene
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,14 @@ class Stage:
     """
 
     def __init__(self, folder: Folder, frames: Sequence[Frame], view: View, paint: Paint):
-        self._window, self.scene, self.view = _window(view), surfaces.Scene(folder, frames), view
-        self._renderer = vtkRenderer(viewport=(0, 0, STAGE, 1), background=(1, 1, 1), use_fxaa=True)
-        self._renderer.SetUseDepthPeeling(view.opacity < 1)
-        margin = vtkRenderer(viewport=(STAGE, 0, 1, 1), background=(1, 1, 1))
+        own = view.colours([body["name"] for body in folder.large])
+        hidden = {row for row, colour in own.items() if not colour[3]}
+        self._window, self.scene, self.view = _window(view), surfaces.Scene(folder, frames, hidden), view
+        self._renderer = vtkRenderer(background=(1, 1, 1), use_fxaa=True)
+        self._renderer.SetUseDepthPeeling(min(view.opacity, *(colour[3] for colour in own.values()), 1.0) < 1)
+        self._shade()
+        self._window.SetNumberOfLayers(2)
+        margin = vtkRenderer(viewport=(STAGE, 0, 1, 1), layer=1)  # over what goes on there of the floor
         for renderer in (self._renderer, margin):
             self._window.AddRenderer(renderer)
         vtkLightKit().AddLightsToRenderer(self._renderer)
@@ -82,9 +87,14 @@ class Stage:
         for mapper in (self._walls, self._shells, self._tools, self._edges):
             mapper.SetResolveCoincidentTopologyToPolygonOffset()
         self._walls.SetRelativeCoincidentTopologyPolygonOffsetParameters(4, 8)  # behind their edges
-        self._add(self._walls, color=(0.88, 0.89, 0.91), ambient=0.75, diffuse=0.25, backface_culling=True)
-        self._add(self._shells, color=(0.72, 0.75, 0.80), ambient=0.3, backface_culling=True)
-        self._add(self._tools, color=(0.58, 0.63, 0.70), ambient=0.3, opacity=view.opacity)
+        for mapper, colour, properties in (
+            (self._walls, (0.88, 0.89, 0.91, 1.0), {"ambient": 0.75, "diffuse": 0.25, "backface_culling": True}),
+            (self._shells, (0.72, 0.75, 0.80, 1.0), {"ambient": 0.3, "backface_culling": True}),
+            (self._tools, (0.58, 0.63, 0.70, view.opacity), {"ambient": 0.3}),
+        ):
+            _colour_bodies(mapper, [own.get(row, colour) for row in range(len(folder.large))])
+            self._add(mapper, **properties)
+        self._edges.ScalarVisibilityOff()
         self._add(self._edges, color=(0.50, 0.52, 0.55), lighting=False, line_width=view.height / 600)
         letters = vtkTextProperty(font_size=round(view.height / 36), color=INK)
         self._stamp = vtkTextActor(position=(0.03 * view.width, 0.03 * view.height), text_property=letters)
@@ -135,6 +145,15 @@ class Stage:
             setattr(actor.GetProperty(), name, value)
         self._renderer.AddActor(actor)
 
+    def _shade(self) -> None:
+        """Let corners and what lies below others be darker: ambient occlusion in screen space."""
+        size = np.linalg.norm(self.scene.box[1] - self.scene.box[0])
+        self._renderer.SetUseSSAO(True)
+        self._renderer.SetSSAORadius(REACH * size)
+        self._renderer.SetSSAOBias(0.02 * REACH * size)
+        self._renderer.SetSSAOKernelSize(64)
+        self._renderer.SetSSAOBlur(True)
+
     def _aim(self, frames: Sequence[Frame]) -> None:
         """Put the camera as near as possible, so that it still sees the scene of all frames."""
         walls = [surfaces.points(self.scene.walls(frame)) for frame in frames]
@@ -153,6 +172,7 @@ class Stage:
         camera.SetFocalPoint(center)
         camera.SetPosition(center + distance / self.view.zoom * ahead)
         camera.SetViewUp(up)
+        camera.SetWindowCenter(1 - STAGE, 0)  # the scene is in the middle of its part of the width
 
 
 def _window(view: View) -> vtkRenderWindow:
@@ -195,6 +215,17 @@ def _lookup_table(paint: Paint) -> vtkLookupTable:
     table.SetTable(numpy_to_vtk(np.ascontiguousarray(colours), deep=True))
     table.SetTableRange(paint.low, paint.high)
     return table
+
+
+def _colour_bodies(mapper: vtkMapper, colours: Sequence[tuple[float, ...]]) -> None:
+    """Let cells have the colour (red, green, blue, alpha) of the row that is their ``body``."""
+    table = vtkLookupTable(number_of_table_values=max(len(colours), 1), table_range=(0, max(len(colours) - 1, 1)))
+    for row, colour in enumerate(colours):
+        table.SetTableValue(row, *colour)
+    mapper.SetScalarModeToUseCellFieldData()
+    mapper.SelectColorArray("body")
+    mapper.SetLookupTable(table)
+    mapper.UseLookupTableScalarRangeOn()
 
 
 def _colour_bar(colours: vtkLookupTable, title: str, letters: vtkTextProperty) -> vtkScalarBarActor:

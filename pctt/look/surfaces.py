@@ -36,6 +36,7 @@ class Wall:
     center: np.ndarray  #: (3,) [m]
     normal: np.ndarray  #: (3,) unit vector towards the grains
     halves: np.ndarray  #: (2, 3) halves of two edges [m]; they and the normal are right-handed
+    row: int  #: of the large body
 
     def corners(self) -> np.ndarray:
         """The corners (4, 3), counterclockwise as seen from the grains."""
@@ -52,20 +53,22 @@ class Scene:
 
     A body is hollow if it is empty around its middle and has a good part of the grains within its bounds, in the first
     or in the last of the ``frames``. Walls are planes and the boxes of hollow bodies, shells are the meshes of hollow
-    bodies, such as drums and silos, and tools are all else. ``box`` (2, 3) has the lowest and the highest corner of
-    grains, shells and tools in all of the frames [m].
+    bodies, such as drums and silos, and tools are all else; their cells have the row of the body as ``body``. ``box``
+    (2, 3) has the lowest and the highest corner of grains, shells and tools in all of the frames [m], ``bed`` that of
+    grains and hollow bodies: walls end above it. The rows of ``hidden`` are as if they were not there.
     """
 
-    def __init__(self, folder: Folder, frames: Sequence[Frame]):
-        self.folder, self._rows = folder, range(len(folder.large))
+    def __init__(self, folder: Folder, frames: Sequence[Frame], hidden: Collection[int] = ()):
+        self.folder, self._rows = folder, [row for row in range(len(folder.large)) if row not in hidden]
         self._hollow = {row for row in self._rows for frame in (frames[0], frames[-1]) if self._is_hollow(frame, row)}
         tables = [frame.table for frame in frames]
         corners = [frame.position[: table.grains] + sign * table.radius[:, None]
                    for frame, table in zip(frames, tables) for sign in (-1, 1)]  # fmt: skip
-        corners += [points(data) for frame in frames for data in (self.tools(frame), self.shells(frame))]
-        self.box = _bounds(corners)
+        corners += [points(self.shells(frame)) for frame in frames]
+        tools = [points(self.tools(frame)) for frame in frames]
+        self.box = _bounds(corners + tools)
         corners += [wall.center[None] for frame in frames for row in self._hollow for wall in self._boxes(frame, row)]
-        self.box = _bounds(corners)
+        self.bed, self.box = _bounds(corners), _bounds(corners + tools)
 
     def surface(self, frame: Frame, row: int, kinds: Collection[str] = ()) -> vtkPolyData:
         """The surface of a large body, or of its shapes of some kinds, without its planes."""
@@ -75,17 +78,18 @@ class Scene:
 
     def tools(self, frame: Frame) -> vtkPolyData:
         """The surfaces of all tools."""
-        return joined(self.surface(frame, row) for row in self._rows if row not in self._hollow)
+        return joined(_of_body(self.surface(frame, row), row) for row in self._rows if row not in self._hollow)
 
     def shells(self, frame: Frame) -> vtkPolyData:
         """The triangles of all shells, as seen from inside."""
         found = []
-        for surface in (self.surface(frame, row, ("Mesh",)) for row in self._hollow):
+        for row in self._hollow:
+            surface = self.surface(frame, row, ("Mesh",))
             corners, middle = triangles(surface), np.reshape(surface.GetBounds(), (3, 2)).mean(axis=1)
             normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             away = np.einsum("mi,mi->m", normal, corners.mean(axis=1) - middle) > 0.0
             corners[away] = corners[away, ::-1]
-            found.append(polydata(corners, "polys", 3))
+            found.append(_of_body(polydata(corners, "polys", 3), row))
         return joined(found)
 
     def walls(self, frame: Frame) -> vtkPolyData:
@@ -98,10 +102,12 @@ class Scene:
         return self._cut(self._planes(frame, row))
 
     def _cut(self, walls: Sequence[Wall]) -> vtkPolyData:
-        """The parts of walls that lie at most MARGIN beyond the scene, and behind no other wall."""
-        beyond = MARGIN * np.linalg.norm(self.box[1] - self.box[0])
+        """The parts of walls that lie at most MARGIN beyond the scene, above beyond the bed, and behind no other
+        wall."""
+        beyond = MARGIN * np.linalg.norm(self.bed[1] - self.bed[0])
+        high = np.append(self.box[1, :2], self.bed[1, 2])
         sides = [(axis, self.box[0] - beyond) for axis in np.eye(3)]
-        sides += [(-axis, self.box[1] + beyond) for axis in np.eye(3)]
+        sides += [(-axis, high + beyond) for axis in np.eye(3)]
         polygons = []
         for wall in walls:
             polygon = wall.corners()
@@ -111,7 +117,8 @@ class Scene:
                 if len(polygon) and other is not wall and other.covers(_before(polygon, -other.normal, other.center)):
                     polygon = _before(polygon, other.normal, other.center)
             polygons.append(polygon)
-        return joined(polydata(polygon, "polys", len(polygon)) for polygon in polygons if len(polygon))
+        pairs = [(polygon, wall.row) for polygon, wall in zip(polygons, walls) if len(polygon)]
+        return joined(_of_body(polydata(polygon, "polys", len(polygon)), row) for polygon, row in pairs)
 
     def _pose(self, frame: Frame, row: int) -> tuple[np.ndarray, np.ndarray]:
         return frame.position[frame.table.grains + row], frame.quaternion[frame.table.grains + row]
@@ -125,7 +132,7 @@ class Scene:
                 point = place + quaternion.rotate(turn, np.array(shape["center"]))
                 first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
                 halves = size / np.linalg.norm(first) * np.array([first, np.cross(normal, first)])
-                found.append(Wall(middle - normal * (normal @ (middle - point)), normal, halves))
+                found.append(Wall(middle - normal * (normal @ (middle - point)), normal, halves, row))
         return found
 
     def _boxes(self, frame: Frame, row: int) -> list[Wall]:
@@ -139,7 +146,7 @@ class Scene:
                 k = int(np.argmax(np.abs(way) - shape["half_extents"]))
                 side = np.sign(way[k])
                 halves = np.array([edges[k - 2], side * edges[k - 1]])
-                found.append(Wall(center + side * edges[k], side * axes[k], halves))
+                found.append(Wall(center + side * edges[k], side * axes[k], halves, row))
         return found
 
     def _is_hollow(self, frame: Frame, row: int) -> bool:
@@ -233,6 +240,12 @@ def triangles(surface: vtkPolyData) -> np.ndarray:
     cells = data.GetPolys()
     order = vtk_to_numpy(cells.GetConnectivityArray()) if cells.GetNumberOfCells() else np.zeros(0, int)
     return points(data)[order.reshape(-1, 3)]
+
+
+def _of_body(data: vtkPolyData, row: int) -> vtkPolyData:
+    """The cells, each with the row of their large body."""
+    add_arrays(data.GetCellData(), {"body": np.full(data.GetNumberOfCells(), row)})
+    return data
 
 
 def joined(parts: Iterable[vtkPolyData]) -> vtkPolyData:

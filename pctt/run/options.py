@@ -195,5 +195,5 @@ def _refuse_places(run: Run, comm: MPI.Comm) -> None:
     if run.dump_problem:
         refuse_unwritable("-dump_problem", Path(run.dump_problem), comm)
     restart = run.restart if not run.problem else ""
-    if refused := comm.bcast(refusal(Path(run.output), restart, run.overwrite)):
+    if refused := comm.bcast(refusal(Path(run.output), restart, run.overwrite, True)):
         raise OptionError(refused)

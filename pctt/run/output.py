@@ -38,14 +38,18 @@ from pctt.petsc import warn
 from pctt.run.settings import Run
 
 
-def refusal(folder: Path, restart: str, overwrite: bool) -> str:
-    """Why a run with these values of -restart and -overwrite may not write to the folder; empty if it may."""
+def refusal(folder: Path, restart: str, overwrite: bool, program: bool) -> str:
+    """Why a run with these values of -restart and -overwrite may not write to the folder; empty if it may. Options are
+    named as Python or, if so, the program has them."""
     there = _held(folder)
     if not there or overwrite or _goes_on(folder, restart):
         return ""
-    goes_on = f", or -restart {quote(str(folder / 'checkpoint.h5'))} to go on with it" * ("checkpoint.h5" in there)
-    allowed = f"another folder, -overwrite to replace that run{goes_on}"
-    return f"-output {folder}: holds a run ({', '.join(there)}); allowed is {allowed}"
+    path, ways = str(folder / "checkpoint.h5"), ("overwrite=True", "Simulation.load({!r}, ...)")
+    if program:
+        path, ways = quote(path), ("-overwrite", "-restart {}")
+    goes_on = f", or {ways[1].format(path)} to go on with it" * ("checkpoint.h5" in there)
+    allowed = f"another folder, {ways[0]} to replace that run{goes_on}"
+    return f"{'-output ' * program}{folder}: holds a run ({', '.join(there)}); allowed is {allowed}"
 
 
 def refuse_unwritable(name: str, folder: Path, comm: MPI.Comm) -> None:
@@ -80,16 +84,19 @@ class Place:
     folder until ``leave``.
     """
 
-    def __init__(self, folder: Path, comm: MPI.Comm, restart: str = "", overwrite: bool = False):
+    def __init__(
+        self, folder: Path, comm: MPI.Comm, restart: str = "", overwrite: bool = False, program: bool = False
+    ):  # fmt: skip
         """``restart`` and ``overwrite`` are the values of the options; collective. FileError on all ranks if another
-        run is writing to the folder, or has written there since the options were read."""
+        run is writing to the folder, or has written there since the options were read; ``program`` as of `refusal`."""
         self.folder, self._comm, self._lock = folder, comm, Lock(folder)
 
         def begin() -> tuple[bool, Path]:
             folder.mkdir(parents=True, exist_ok=True)
             if not self._lock.take():
-                raise FileError(f"-output {folder}: another run is writing there; allowed is another folder")
-            if refused := refusal(folder, restart, overwrite):
+                name = f"{'-output ' * program}{folder}"
+                raise FileError(f"{name}: another run is writing there; allowed is another folder")
+            if refused := refusal(folder, restart, overwrite, program):
                 self.leave()
                 raise FileError(refused)
             shutil.rmtree(folder / ".new", ignore_errors=True)  # of a run that ended before its first step stood

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import sys
@@ -127,7 +128,7 @@ class Progress:
         started = any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"))
         self._active = self._active and sys.stdout is not None  # closed by the shell
         self._live = self._active and not started and sys.stdout.isatty()
-        self._begun, self._first = time.perf_counter(), -1
+        self._begun, self._first, self._tenth = time.perf_counter(), -1, 0
 
     def say(self, text: str = "") -> None:
         self._print("\r\033[K" * self._live + text + "\n")
@@ -152,6 +153,18 @@ class Progress:
             left = f", {remaining(spent, made, end - self._first)}" if made else ""
             line = f"step {done + 1}, time {now:.3f} s ({made + 1} of {end - self._first}){left} ..."
             self._print(f"\r\033[K{line[: shutil.get_terminal_size().columns - 1]}")
+
+    def passed(self, done: int, now: float, end: float) -> None:
+        """As `doing` for a run from Python: where no line passes, in a notebook or a file, there is one for each tenth
+        of the way, or of each thousand steps if nobody knows the ``end``."""
+        known = math.isfinite(end)
+        self.doing(done, now, int(end) if known else done)
+        spent, made, whole = time.perf_counter() - self._begun, done - self._first, end - self._first
+        tenth = int(10 * made / max(whole, 1)) if known else made // 1000
+        if tenth > self._tenth and not (self._live and known and done < end):
+            self._tenth = tenth
+            left = f", {remaining(spent, made, int(whole))}" if known and done < end else ""
+            self.say(f"time {now:.3f} s: {made}{f' of {whole:.0f}' * known} steps in {spent:.0f} s{left}")
 
 
 def remaining(spent: float, done: int, steps: int) -> str:

@@ -139,7 +139,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         progress.say(f"NOT CONVERGED: {summary['reason']}")
     if left := remark(options.given, newton.ksp_systems):
         progress.say(left)
-    place = Place(Path(options.run.output), comm, overwrite=options.run.overwrite)
+    place = Place(Path(options.run.output), comm, overwrite=options.run.overwrite, program=True)
     try:
         place.make()
         path = place.now / "summary.json"

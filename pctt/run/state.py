@@ -20,7 +20,7 @@ from mpi4py import MPI
 from dem.arrays import Floats
 from dem.bodies import Bodies
 from dem.exchange import refuse
-from dem.experiment import Experiment
+from dem.experiment import Experiment, Given
 from dem.mesh import Mesh
 from dem.model.changes import changes, restore
 from dem.model.world import World
@@ -88,21 +88,30 @@ def _numeric(value: Any) -> bool:
     return np.asarray(value).dtype.kind in "fiub"
 
 
-def world_at_start(experiment: Experiment, settings: Settings, scene: Scene, comm: MPI.Comm) -> World:
-    """What the experiment built, at time zero; OptionError if it cannot start so."""
-    name = type(experiment).__name__
+def scene_words(experiment: Experiment) -> str:
+    """What messages call a scene."""
+    return "the scene" if isinstance(experiment, Given) else f"scene {scene_name(experiment)}"
+
+
+def world_at_start(
+    experiment: Experiment, settings: Settings, scene: Scene, comm: MPI.Comm, program: bool = False
+) -> World:
+    """What the experiment built, at time zero; OptionError if it cannot start so, which names options as Python or, if
+    so, the program has them."""
+    what = scene_words(experiment)
     try:
         world = new_world(scene, comm, math.inf)
     except (ValueError, FloatingPointError) as error:  # the latter of velocities whose squares overflow
-        raise OptionError(f"scene {name}: {error}") from None
+        raise OptionError(f"{what}: {error}") from None
     if settings.overlap == RELAX:
         relax(world, scene, settings)
         return world
     try:
         refuse_overlap(world, float(settings.overlap))
     except ValueError as error:
-        helps = "-overlap relax opens overlaps before the first step, a number allows greater ones"
-        raise OptionError(f"scene {name}: {error}. What helps: {helps}") from None
+        option = f"-overlap {RELAX}" if program else f'overlap="{RELAX}"'
+        helps = f"{option} opens overlaps before the first step, a number allows greater ones"
+        raise OptionError(f"{what}: {error}. What helps: {helps}") from None
     return world
 
 
@@ -111,13 +120,14 @@ def world_at_start(experiment: Experiment, settings: Settings, scene: Scene, com
 
 def origin(experiment: Experiment, scene: Scene, dt: float) -> dict[str, Any]:
     """What a run should share with the run whose checkpoint it continues, as attributes of a checkpoint: the name and
-    the options of the scene as JSON, the time step [s], the digest of the user's scene file or "", and what tells the
-    surfaces of large bodies apart as JSON."""
+    the options of the scene as JSON, the time step [s], the digest of the user's scene file or "", what tells the
+    surfaces of large bodies apart, and the figures of the scene, as JSON."""
     return {
         "scene": json.dumps({"scene": scene_name(experiment), **dataclasses.asdict(experiment)}, sort_keys=True),
         "dt": dt,
         "scene_file": experiment.digest,
         "surfaces": json.dumps(_surfaces(scene.large_bodies), sort_keys=True),
+        "figures": json.dumps(scene.figures()),
     }
 
 
@@ -187,12 +197,14 @@ def restored(kept: Kept, scene: Scene, comm: MPI.Comm, times: float = 1.0) -> tu
     return world, memory
 
 
-def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) -> tuple[World, ImpulseMemory]:
-    """The world and the impulses of a checkpoint of the scene; collective.
+def load(
+    path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm, program: bool = False
+) -> tuple[World, ImpulseMemory]:
+    """The world and the impulses of a checkpoint of the scene; collective. ``program`` as of `world_at_start`.
 
     If the number of ranks is that of the writing run, the world is the same to the last bit. Raises FileError if the
     file is no checkpoint or damaged, and OptionError if it is of another scene or option; warns of another text of the
-    scene file or surface of a body. Where the time step is another, impulses are scaled to it.
+    scene file, surface of a body or figure of the scene. Where the time step is another, impulses are scaled to it.
     """
     columns = [field.name for field in dataclasses.fields(Bodies)]
 
@@ -205,17 +217,20 @@ def load(path: Path, scene: Scene, made_with: dict[str, Any], comm: MPI.Comm) ->
         rows, contacts = restart_rows(replicated["slabs"], comm), even_slice(number, comm)
         local = {name: file[f"grains/{name}"][rows] for name in columns}
         changed = replicated.pop("changes")[0].decode()
-        old = {name: file.attrs[name] for name in made_with}
+        old = {name: file.attrs[name] for name in made_with if name != "figures"}
+        old["figures"] = file.attrs.get("figures", made_with["figures"])  # older files have none
         impulses = tuple(file[name][contacts] for name in CONTACTS)
         return old, json.loads(file.attrs["scene"]), replicated, changed, local, impulses
 
     old, scene_of, replicated, changed, local, impulses = read(path, comm, take)
-    _refuse_other_origin(path, old, scene_of, made_with, comm)
+    _refuse_other_origin(path, old, scene_of, made_with, program)
     times = 1.0 if old["dt"] == made_with["dt"] else made_with["dt"] / old["dt"]
     try:
-        return restored(Kept(local, replicated, changed, impulses), scene, comm, times)
+        found = restored(Kept(local, replicated, changed, impulses), scene, comm, times)
     except (AttributeError, KeyError, TypeError, ValueError) as error:  # of another scene file
-        raise OptionError(f"-restart {path}: {error}") from None
+        raise OptionError(f"{'-restart ' * program}{path}: {error}") from None
+    _tell_other_origin(path, old, made_with, comm)
+    return found
 
 
 def _refuse_other_format(file: h5py.File) -> None:
@@ -231,17 +246,31 @@ def _refuse_other_slabs(slabs: np.ndarray, count: int) -> None:
 
 
 def _refuse_other_origin(
-    path: Path, old: dict[str, Any], old_scene: dict[str, Any], new: dict[str, Any], comm: MPI.Comm
+    path: Path, old: dict[str, Any], old_scene: dict[str, Any], new: dict[str, Any], program: bool
 ) -> None:
-    """OptionError for the first option in which two origins differ, and warnings of what else does."""
+    """OptionError for the first option in which two origins differ."""
     new_scene = json.loads(new["scene"])
-    pairs = [("-scene", old_scene["scene"], new_scene["scene"])]
+    pairs = [("-scene" if program else "scene", old_scene["scene"], new_scene["scene"])]
     absent = "(no such option)"
     names = [name for name in {**new_scene, **old_scene} if name != "scene"]
-    pairs += [(f"-scene_{name}", old_scene.get(name, absent), new_scene.get(name, absent)) for name in names]
+    pairs += [("-scene_" * program + name, old_scene.get(name, absent), new_scene.get(name, absent)) for name in names]
     for option, was, now in pairs:
         if was != now:
             raise OptionError(f"{option} {now}: {path} was made with {option} {was}; allowed is the same")
+
+
+def _tell_other_origin(path: Path, old: dict[str, Any], new: dict[str, Any], comm: MPI.Comm) -> None:
+    """Warn of what else differs between two origins."""
+
+    def value(figures: dict[str, str], name: str) -> str:  # of a pair without coefficients of its own those of all
+        return figures.get(name, figures.get(name.partition(" of ")[0], "none"))
+
+    before, now = json.loads(old["figures"]), json.loads(new["figures"])
+    names = [name for name in {**now, **before} if before.get(name) != now.get(name)]
+    if names:
+        told = ", ".join(f"{name} {value(before, name)}, now {value(now, name)}" for name in names[:10])
+        holds = "gravity and laws of contact are those of now, masses, sizes and materials those of before"
+        warn(comm, f"{path} was made with {told}{', and more' * (len(names) > 10)}; {holds}")
     for name, what in {"scene_file": "another text of the scene file", "surfaces": "other surfaces of bodies"}.items():
         if old[name] != new[name]:
             warn(comm, f"{path} was made with {what}: {old[name][:200] or 'none'}, now {new[name][:200] or 'none'}")
@@ -255,7 +284,7 @@ def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_
     run's settings that is ``settle_tol``. OptionError if the scene never settles."""
     about = json.loads(made_with["scene"])
     if not experiment.settling_time:
-        raise OptionError(f"-scene {about['scene']}: has no settling_time and so no settled state")
+        raise OptionError(f"{scene_words(experiment)}: has no settling_time and so no settled state")
     how: dict[str, Any] = {
         "dt": time_step.for_settling(scene),
         "delta": settling_distances(experiment, scene),

@@ -239,7 +239,7 @@ def _refuse_squeezed(world: World, result: ccp.Result) -> None:
     if result.status is ccp.Status.UNBOUNDED:
         raise NoSolutionError(
             f"step {world.step + 1}: {result.reason}: rigid bodies are squeezed, and no impulses stop it; the "
-            "run ends with the state before. What helps: a -stiffness, a smaller -dt, or tools of bounded force"
+            "run ends with the state before. What helps: a stiffness, a smaller dt, or tools of bounded force"
         )
 
 

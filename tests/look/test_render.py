@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import handmade
 import numpy as np
 import pytest
 
 from pctt import render as program
+from pctt.look.program import View
+from pctt.options import OptionError
 
 pytest.importorskip("pctt.look.surfaces", reason="vtk 9.4 is not installed (extra `pictures`)")
 image = pytest.importorskip("PIL.Image", reason="pillow is not installed (extra `pictures`)")
@@ -111,3 +115,28 @@ def test_materials_have_a_legend_with_their_names(render, tmp_path):
 )
 def test_ends_of_the_colours(colour, values, ends):
     assert program.ends_of(colour, np.array(values, dtype=float)) == ends
+
+
+def test_bodies_have_the_colours_that_are_given():
+    """By matplotlib's names; what is transparent hides nothing."""
+    found = View(bodies={"blade": "orange", "box": "none", "lid": ("b", 0.5)}).colours(["box", "blade", "lid"])
+    assert found == {1: (1.0, pytest.approx(165 / 255), 0.0, 1.0), 0: (0.0,) * 4, 2: (0.0, 0.0, 1.0, 0.5)}
+    for bodies, words in (
+        ({"blad": "red"}, "bodies: there is no large body 'blad'; allowed is one of box, blade; did you mean blade?"),
+        ({"blade": "ornge"}, "bodies: the colour 'ornge' of 'blade'; allowed is one that matplotlib knows"),
+    ):
+        with pytest.raises(OptionError, match=re.escape(words)):
+            View(bodies=bodies).colours(["box", "blade"])
+
+
+def test_a_body_is_drawn_in_its_colour_or_not_at_all(render, folder, tmp_path):
+    pure = []
+    for name, bodies in {"red": "mixer=red", "alone": "box=none,mixer=red", "hidden": "mixer=none"}.items():
+        render("-output", tmp_path / name, "-first", 4, "-cut", "-bodies", bodies, folder=folder)
+        red, green, blue = np.moveaxis(pixels(tmp_path / name / "000004.png")[:, :275], 2, 0)
+        pure.append(np.count_nonzero((red > 100) & (green < 40) & (blue < 40)))
+    assert min(pure[:2]) > 100
+    assert pure[2] == 0
+    done = render("-bodies", "mixr=red", folder=folder, status=2)
+    assert "there is no large body 'mixr'; allowed is one of box, mixer; did you mean mixer?" in done.stderr
+    assert "mixer: allowed is NAME=COLOR" in render("-bodies", "mixer", folder=folder, status=2).stderr

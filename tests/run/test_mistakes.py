@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import copy
+import re
 import warnings
 
+import numpy as np
 import pytest
+from mpi4py import MPI
 
+import pctt
 from pctt import Box, Dynamic, Plane, Scene, Simulation
+from pctt.disk import FileError
 from pctt.options import OptionError
+from pctt.scenes import Mixer
 
 
 def falling(**law):
@@ -57,3 +64,113 @@ def test_unused_materials_and_rolling_of_more_than_a_radius_are_told():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Simulation(scene)
+
+
+def test_a_scene_that_a_simulation_has_stays_as_it_is():
+    """Its copy does not."""
+    scene = falling()
+    sim = Simulation(scene)
+    words = "a simulation was made of this scene, and would not see the change; allowed are a copy"
+    for change in (
+        lambda scene: scene.add_spheres([0, 0, 1], 0.05, 1500.0),
+        lambda scene: scene.set_pair("glass", "glass", friction=0.1),
+        lambda scene: scene.add_body("lid", [Plane((0, 0, -1), (0, 0, 2))]),
+        lambda scene: setattr(scene, "gravity", (0, 0, 0)),
+    ):
+        with pytest.raises(ValueError, match=words):
+            change(scene)
+    with pytest.raises(ValueError, match="read-only"):
+        scene.gravity[2] = 0.0
+    other = copy.deepcopy(scene)
+    other.gravity[:] = 0.0
+    other.add_spheres([0, 0, 1], 0.05, 1500.0)
+    with Simulation(other, dt=0.01) as floats:
+        floats.step()
+        assert len(floats.positions) == len(sim.positions) + 1
+        assert not floats.velocities.any()
+    assert Simulation(scene, dt=0.01).copy().step()["contacts"] == 0
+
+
+def test_names_that_a_scene_does_not_have_are_refused():
+    scene = falling()
+    with pytest.raises(AttributeError, match="a Scene has no 'gravty' to set; did you mean gravity?"):
+        scene.gravty = (0, 0, 0)
+    with pytest.raises(TypeError, match="add_body: there is no argument 'dencity'; .*; did you mean density?"):
+        scene.add_body("b", [Box((1, 1, 1))], Dynamic(), dencity=1e3)
+    with pytest.raises(OptionError, match="tolerance: no such setting; .*; did you mean tol?"):
+        Simulation(scene, tolerance=1e-4)
+    with pytest.raises(OptionError, match="time_step: no such setting; .*; did you mean dt?"):
+        Simulation(scene, time_step=1e-4)
+    with pytest.raises(AttributeError, match="module 'pctt' has no attribute 'Simulaton'; did you mean Simulation?"):
+        pctt.Simulaton  # noqa: B018
+
+
+@pytest.mark.parallel(2)
+def test_arrays_of_a_simulation_cannot_be_written_to():
+    sim = Simulation(falling())
+    sim.step()
+    floor, local = sim.body("floor"), sim.local
+    arrays = [sim.positions, sim.velocities, sim.orientations, sim.ids, floor.position, floor.velocity]
+    arrays += [sim.contacts.gap, sim.contacts.point, local.position, local.velocity]
+    for array in arrays:
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+    before = sim.positions
+    sim.step()
+    assert (before[:, 2] > sim.positions[:, 2]).all()  # and are no views
+
+
+@pytest.mark.parallel(2)
+def test_other_figures_than_those_of_a_checkpoint_are_told(tmp_path):
+    """By their names, with both values; the laws of now hold, the masses of before."""
+    sim = Simulation(falling(stiffness=1e5), dt=0.01)
+    sim.step()
+    sim.save(tmp_path / "a.h5")
+    scene = Scene(0.1, gravity=(0, 0, -1.62), stiffness=1e5)
+    scene.add_spheres([[0, 0, 0.3], [1, 0, 0.4]], 0.05, 3000.0, material="glass")
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.set_pair("glass", "default", friction=0.2)
+    mass = 2 * 1500 * 4 / 3 * np.pi * 0.05**3
+    words = r"friction 0.5, now 0.1, friction of glass with default 0.5, now 0.2, gravity z .* -9.81, now -1.62, "
+    words += rf"mass of the grains .kg. {mass:.5g}, now {2 * mass:.5g}; gravity and laws of contact are those of now"
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", UserWarning)
+        loaded = Simulation.load(tmp_path / "a.h5", scene, dt=0.01)
+    if MPI.COMM_WORLD.rank == 0:
+        assert re.search(words, str(told[0].message))
+    loaded.step()
+    np.testing.assert_allclose(loaded.velocities[:, 2], -0.01 * (9.81 + 1.62), rtol=1e-9)
+    np.testing.assert_allclose(loaded.local.mass, mass / 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Simulation.load(tmp_path / "a.h5", falling(stiffness=1e5), dt=0.01)
+
+
+@pytest.mark.parallel(2)
+def test_overlaps_at_the_start_are_told_with_their_number_and_the_place_of_the_worst():
+    scene = falling()
+    scene.add_spheres([[0, 0, 0.38], [1, 0, 0.46], [5, 5, 0.05]], 0.05, 1500.0)
+    words = r"grain 1 and grain 3 overlap by 0.04 m at \(1, 0, 0.43\) m, 0.8 half.*, as at 1 other contacts. What helps"
+    with pytest.raises(OptionError, match=words):
+        Simulation(scene)
+
+
+def test_messages_speak_python(tmp_path):
+    with Simulation(falling(), dt=0.01) as sim:
+        sim.write(tmp_path / "out")
+        sim.step()
+    words = rf"^{tmp_path}/out: holds a run .*, overwrite=True .*, or Simulation.load\('{tmp_path}/out/checkpoint.h5', "
+    with pytest.raises(FileError, match=words):
+        Simulation(falling()).write(tmp_path / "out")
+    scene = falling()
+    scene.add_spheres([0, 0, 0.31], 0.05, 1500.0)
+    with pytest.raises(OptionError, match=f"^{tmp_path}/out/checkpoint.h5: the state has 2 grains .*, the scene 3"):
+        Simulation.load(tmp_path / "out" / "checkpoint.h5", scene)
+    with pytest.raises(OptionError, match='^the scene: overlapping .* What helps: overlap="relax" opens'):
+        Simulation(scene)
+    with pytest.raises(OptionError, match="^the scene: has no settling_time"):
+        Simulation(falling(), restart="settled")
+    with Simulation(Mixer(n=1), comm=MPI.COMM_SELF) as sim:
+        sim.save(tmp_path / "mixer.h5")
+    with pytest.raises(OptionError, match=f"^n 2: {tmp_path}/mixer.h5 was made with n 1; allowed is the same"):
+        Simulation.load(tmp_path / "mixer.h5", Mixer(n=2))

@@ -130,7 +130,6 @@ def folder(tmp_path_factory) -> Path:
     """Where the lines find the files that they name."""
     folder = tmp_path_factory.mktemp("lines")
     (folder / "docs").symlink_to(ROOT / "docs")
-    (folder / "column.py").write_text(blocks("README.md")[0])
     (folder / "hopper.py").write_text(blocks("docs/tutorial.md")[0])
     (folder / "bucket.stl").write_text("solid bucket\nendsolid bucket\n")
     stored_problem(folder / "problem.hdf5")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -14,12 +15,14 @@ from program import DROP, ROOT, arrays, assert_same_bits, database, table
 
 import pctt
 from dem.experiment import Experiment, option
-from dem.motion import Fixed, Glide, Guided, Hinged, Oscillation, Rotation
+from dem.mesh import Mesh
+from dem.motion import Dynamic, Fixed, Glide, Guided, Hinged, Oscillation, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.together import SceneError
 from pctt.ccp.first_order.apgd import APGD
 from pctt.disk import FileError
+from pctt.folder import Folder
 from pctt.options import OptionError
 from pctt.run.options import read_options
 from pctt.run.simulate import simulate
@@ -501,3 +504,40 @@ def test_a_time_step_that_is_too_large_is_warned_of():
     scene.add_spheres([0.0, 0.0, 0.1], 0.1, 1000.0, velocity=(100.0, 0.0, 0.0))
     with pytest.warns(UserWarning, match=r"dt 0.01 s is too large: a grain goes further .* at most 0.00095 s"):
         pctt.Simulation(scene, dt=0.01, comm=MPI.COMM_SELF)
+
+
+def test_objects_say_what_they_are(tmp_path):
+    """In a line or two, and their columns are those of a table, as pandas takes it."""
+    scene = Scene(0.5)
+    scene.add_spheres([[0, 0, 0.1], [1, 0, 0.1]], 0.1, 1e3)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_body("lid", [Mesh.revolved([(0, 1), (1, 1), (0, 2)], 9)], Dynamic(), mass=1.0, inertia=(1, 1, 1))
+    scene.add_joint("hinge", "lid", anchor=(0, 0, 1))
+    sim = pctt.Simulation(scene, dt=0.001, comm=SELF)
+    sim.write(tmp_path)
+    sim.step()
+    sim.complete()
+    shown = [scene, sim, sim.contacts, sim.local, sim.sample, sim.last, sim.world, sim.body("lid"), sim.joint("hinge")]
+    shown += [Folder(tmp_path), Folder(tmp_path).frame(1), *(body.shapes[0] for body in scene.large_bodies)]
+    for thing in shown:
+        assert " object at 0x" not in repr(thing)
+        assert len(repr(thing)) < 300
+    assert "Mesh of 18 triangles" in repr(shown[-1])
+    for grains_or_contacts in (sim.contacts, sim.local):
+        columns = dict(grains_or_contacts)
+        assert all(column.shape == (2,) for column in columns.values())
+    assert dict(sim.contacts)["force_z"].tolist() == sim.contacts.force[:, 2].tolist()
+
+
+def test_the_way_to_the_end_is_told(capsys):
+    """For each tenth of it."""
+    sim = pctt.Simulation(Mixer(n=1), dt=0.01, comm=SELF)
+    sim.run(steps=20, progress=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 10
+    assert re.fullmatch(r"time 0.020 s: 2 of 20 steps in \d+ s, about .* left", lines[0])
+    assert re.fullmatch(r"time 0.200 s: 20 of 20 steps in \d+ s", lines[-1])
+    sim.run(stop=lambda sim: sim.steps == 25, progress=True)
+    assert capsys.readouterr().out.startswith("time 0.250 s: 5 of 5 steps in ")
+    sim.run(steps=5)
+    assert capsys.readouterr().out == ""
