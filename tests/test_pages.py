@@ -15,7 +15,6 @@ import tomllib
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dem.experiment import from_file
 from dem.parts.contact_law import ContactLaw
 from dem.parts.sources import Source
 from pctt import Folder, Simulation, ccp
