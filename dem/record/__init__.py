@@ -16,7 +16,7 @@ from dem import bodies
 from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
-from dem.exchange import reduced
+from dem.exchange import reduced, told
 from dem.experiment import Experiment
 from dem.motion import Held
 from dem.start import stiffness
@@ -198,7 +198,7 @@ def energy_balance(step: Step) -> dict[str, float]:
         "impact_loss [J]": 0.0 - whole["normal"] - held,
         **({} if system.attraction is None else {"work_of_cohesion [J]": whole["attracted"]}),
         "time_stepping [J]": made,
-        "energy_jump [J]": comm.bcast(rise if jumps else 0.0),  # what follows from it must not differ between ranks
+        "energy_jump [J]": told(comm, rise if jumps else 0.0),  # what follows from it must not differ between ranks
     }
 
 

@@ -23,6 +23,7 @@ from mpi4py import MPI
 
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
+from dem.exchange import told
 from dem.free_motion import free_spin, unequal
 from dem.model.world import World
 from dem.motion import DROOP
@@ -233,13 +234,13 @@ def coupling_of(
         gathered[slot] = push[here]
         world.comm.Allreduce(MPI.IN_PLACE, gathered)
     found = coupling(parts, ends, dt, world.cell, gathered) if world.comm.rank == 0 else None
-    return world.comm.bcast(found)  # processors may round in other ways
+    return told(world.comm, found)
 
 
 def coupling_refound(world: World, known: Coupling, push: Floats) -> Coupling | None:
     """`refound`, by the first rank for all; collective."""
     found = refound(known, push) if world.comm.rank == 0 else None
-    return world.comm.bcast(found)
+    return told(world.comm, found)
 
 
 def slots(world: World, id: Ints) -> tuple[Ints, Ints]:
