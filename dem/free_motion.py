@@ -46,7 +46,7 @@ def velocity_changes(table: Bodies, impulse: Floats) -> Floats:
     change = np.empty_like(impulse)
     change[:, :3] = impulse[:, :3] / table.mass[:, None]
     change[:, 3:] = impulse[:, 3:] / table.inertia  # of spheres
-    rows = np.flatnonzero(impulse[:, 3:].any(axis=1) & (table.shape != bodies.SPHERE))
+    rows = (impulse[:, 3:].any(axis=1) & (table.shape != bodies.SPHERE)).nonzero()[0]
     root = bodies.inverse_root_inertia(table.take(rows))
     change[rows, 3:] = (root @ (root @ impulse[rows, 3:, None]))[:, :, 0]
     return change
@@ -54,7 +54,7 @@ def velocity_changes(table: Bodies, impulse: Floats) -> Floats:
 
 def gyroscopic(table: Bodies) -> Ints:
     """The rows of bodies that turn freely and whose three moments are not equal."""
-    rows = np.flatnonzero(bodies.is_dynamic(table) & (table.shape != SPHERE))
+    rows = (bodies.is_dynamic(table) & (table.shape != SPHERE)).nonzero()[0]
     return rows[unequal(table.inertia[rows])]
 
 

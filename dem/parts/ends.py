@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Union
 
@@ -50,6 +50,10 @@ class Geometry(NamedTuple):
     axes: Floats  #: (n, 3, 3) rows x, y, z in the world
 
 
+#: A function of positions (bodies, 3) [m] and quaternions (bodies, 4).
+Place = Callable[[Floats, Floats], Geometry]
+
+
 class Condition(NamedTuple):
     """What a constraint asks of one of its six relative velocities."""
 
@@ -64,12 +68,9 @@ class Constraint(Tie):
     contacts; see `dem.unconstrained.constraints`."""
 
     @classmethod
-    def geometry(
-        cls, members: Sequence[Any], row: Ints, position: Floats, orientation: Floats, cell: Cell
-    ) -> Geometry:
-        """Of n parts of the kind between bodies in the rows `row` (n, 2), with positions (bodies, 3) [m] and
-        quaternions (bodies, 4). The second ends are those images in the cell whose anchors are
-        nearest to the first ones."""
+    def geometry(cls, members: Sequence[Any], row: Ints, cell: Cell) -> Place:
+        """Of n parts of the kind between bodies in the rows `row` (n, 2) what their places make of them. The second
+        ends are those images in the cell whose anchors are nearest to the first ones."""
         raise NotImplementedError
 
     def conditions(self, error: Floats, dt: float) -> list[Condition]:
