@@ -11,7 +11,7 @@ import math
 import numbers
 import sys
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any, TypeVar
 
@@ -107,7 +107,7 @@ def refuse_bad(group: Any) -> None:
             _refuse(f"{f.name} {value}", value, kind, f.metadata)
 
 
-_hints = cache(typing.get_type_hints)
+_hints: Callable[[Any], dict[str, Any]] = cache(typing.get_type_hints)
 
 #: What an option of each type may be in Python.
 _TYPES: dict[Any, type] = {int: numbers.Integral, float: numbers.Real, bool: bool, str: str}

@@ -200,7 +200,7 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
     pair, point, normal, gap, others = touch_spheres(
         table.kind, table.center, table.quaternion, table.size, i, j, delta
     )
-    found = [Manifold(pair, np.zeros_like(pair), Touch(point, normal, gap))]
+    found = [Manifold(pair, np.zeros(len(pair), np.int64), Touch(point, normal, gap))]
     if not len(others):
         return found[0]
     i, j, delta = i[others], j[others], delta[others]

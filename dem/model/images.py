@@ -68,7 +68,7 @@ class Images:
 
     def now(self, cell: Cell) -> Images:
         """The same where the shear and the size of the cell have brought them."""
-        return replace(self, way=cell.moved(self.steps, self.across))
+        return replace(self, way=cell.moved(self.steps, self.across)) if len(self) else self
 
     @cached_property
     def rows(self) -> Ints:

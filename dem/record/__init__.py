@@ -220,7 +220,7 @@ def works(
     velocities `before` (rows, 6), of all rows of `near`, and of those after the step [J]; and the normal velocities
     (nc,) of the latter; collective."""
     system, near = step.system, step.contacts.near
-    after = np.zeros_like(before)
+    after = np.zeros(before.shape)
     after[: near.grains] = step.world.grains.velocity
     system.contact_map.halo.update(after)
     after[near.grains + near.ghosts :] = step.world.large.velocity

@@ -166,7 +166,7 @@ class ContactSystem:
         if push is None and turns_unlike_spheres(world):
             push = self.contact_map.momenta(self.net(last))
         if push is not None:
-            change = np.empty_like(push)
+            change = np.empty(push.shape)
             scale(self.contact_map.given.root, push, change)
             struck = self.dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
             push[struck], change[struck] = 0.0, 0.0
@@ -279,7 +279,7 @@ class ContactSystem:
 
     def velocity_with(self, momentum: Floats) -> Floats:
         """Velocities (owned, 6) after the step for the mass-scaled momenta G' g (owned, 6), in any shape."""
-        change = np.empty_like(self.free_velocity)
+        change = np.empty(self.free_velocity.shape)
         self.contact_map.mass.scale(momentum.reshape(-1, 6), change)
         return self.free_velocity + change
 

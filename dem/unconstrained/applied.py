@@ -48,7 +48,7 @@ def applied_impulses(world: World, dt: float, given: Floats) -> Applied | None:
     kinds = kinds_of(Force, world.named)
     if not kinds:
         return None
-    applied = Applied(dt, given, np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity))
+    applied = Applied(dt, given, np.zeros(world.grains.velocity.shape), np.zeros(world.large.velocity.shape))
     for kind, acting, members in kinds:
         memory = acting.act(members, world, applied)
         if memory is not None:

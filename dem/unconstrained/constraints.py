@@ -111,7 +111,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     motors = np.isfinite(bound)
     slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
     on, given = kind <= MOTOR, np.zeros(len(t))
-    rows = np.flatnonzero(unequal(ends.moments))
+    rows = unequal(ends.moments).nonzero()[0]
     known = ends.quaternion[rows], ends.velocity[rows, 3:], ends.moments[rows]
     spin, middle = np.full((2, count, 3), np.nan)
     held, left = kind == HELD, t.copy()
@@ -196,8 +196,8 @@ def _solved(
     g = _impulses(A, t, free, on, given)
     room = bound - np.abs(g)  # not positive where only contacts bring a motor to its speed: it is held there
     yields = np.isfinite(bound) & (room > 0.0)
-    e = np.divide(slip, room, out=np.zeros_like(slip), where=yields)
-    solver = np.zeros_like(A)
+    e = np.divide(slip, room, out=np.zeros(slip.shape), where=yields)
+    solver = np.zeros(A.shape)
     solver[np.ix_(on, on)] = np.linalg.pinv(A[on][:, on] + np.diag(e[on]), rcond=1e-12, hermitian=True)
     value, vector = np.linalg.eigh(B.T @ solver @ B)
     K = (vector * (1.0 - np.sqrt(np.clip(1.0 - value, 0.0, 1.0)))) @ vector.T
@@ -230,11 +230,11 @@ def coupling_of(
     parts = _parts(world)
     if not parts:
         return None
-    grains, large = np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity)
+    grains, large = np.zeros(world.grains.velocity.shape), np.zeros(world.large.velocity.shape)
     if applied is not None:
         grains, large = applied.grains, applied.large
     ends = ends_of(world, [part for _, members in parts for part in members], grains, large, given, dt)
-    gathered = np.zeros_like(ends.free)
+    gathered = np.zeros(ends.free.shape)
     if push is not None:
         id = np.concatenate([world.grains.id, world.large.id])[: len(push)]
         here, slot = slots(world, id)

@@ -98,8 +98,8 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: An
     flat, space = velocity.ndim == 2 and velocity.shape[1] == 2, velocity.ndim == 2 and velocity.shape[1] == 3
     space = space or (velocity.ndim == 1 and velocity.size > 0)
     facts = bool(words), flat, space, friction.ndim == 2, parts == 1, parts > 1
-    _, every = reduced(comm, (), (*facts, *kinds, *(-kind for kind in kinds)))
-    wrong, plane, space, elliptic, plain, moments, *every = map(int, every)
+    _, most = reduced(comm, (), (*facts, *kinds, *(-kind for kind in kinds)))
+    wrong, plane, spatial, elliptic, plain, moments, *every = map(int, most)
     if wrong:
         refuse(comm, words)
     for name, last, first in zip(COLLECTIVE, every, every[len(kinds) :]):
@@ -108,7 +108,7 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: An
             raise ValueError(f"{name} is {found}; allowed is one of them on all")
     if plain and moments:
         raise ValueError("cones have moments on some ranks, and none on others; allowed is one of both")
-    if plane and space:
+    if plane and spatial:
         raise ValueError("r has 2 columns on some ranks and 3 on others; allowed is one of both")
     width = 2 if plane else 3
     velocity, friction = np.ascontiguousarray(velocity.reshape(-1, width)), np.ascontiguousarray(friction)

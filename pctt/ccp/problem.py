@@ -161,7 +161,7 @@ class ConeProblem:
         """Impulses (nc, 3) in the cones from the user's."""
         if self.units is None:
             return impulse
-        g = np.zeros_like(self.r)
+        g = np.zeros(self.r.shape)
         given = self.units[:, : self._width]
         np.divide(impulse, given, out=g[:, : self._width], where=given > 0.0)
         return g
@@ -177,7 +177,7 @@ class ConeProblem:
 
     def product(self, g: Array) -> Array:
         """N g for impulses g (nc, 3): velocities of the contacts (nc, 3)."""
-        y = np.zeros_like(self.r)
+        y = np.zeros(self.r.shape)
         self.operator.add_delassus(g, y)
         if self.yields:
             y += self.compliance * g

@@ -123,7 +123,7 @@ def _passing(system: ContactSystem, tools: Floats) -> Floats:
     of a cell have at each contact."""
     at_contacts = [known for known in (system.surface, system.drift) if known is not None]
     if tools.any():
-        table = np.zeros_like(system.near.bodies.velocity)
+        table = np.zeros(system.near.bodies.velocity.shape)
         table[len(table) - len(tools) :] = tools
         at_contacts.append(system.contact_map.relative_velocities(table))
     most = np.zeros(len(system.contacts))
