@@ -105,6 +105,11 @@ def told(comm: MPI.Comm, value: Out) -> Out:
     return value if comm.size == 1 else comm.bcast(value)
 
 
+def greatest(comm: MPI.Comm, value: Out) -> Out:
+    """The greatest value of all ranks; collective."""
+    return value if comm.size == 1 else comm.allreduce(value, MPI.MAX)
+
+
 def _sums_and_most(here: Any, everywhere: Any, kind: MPI.Datatype) -> None:
     one, both = np.frombuffer(here), np.frombuffer(everywhere)
     most = int(one[0]) + 1

@@ -12,6 +12,7 @@ from dem import checks
 from dem.arrays import Floats, Ints
 from dem.parts.cell import Cell
 from dem.parts.named import Named
+from dem.quaternion import cross
 
 HELD, MOTOR, LOWER, UPPER = range(4)  #: kinds of conditions: what is held, a motor, limits
 
@@ -45,9 +46,18 @@ class Tie(Named):
 class Geometry(NamedTuple):
     """n constraints as they are."""
 
-    rows: Floats  #: (n, 6, 2, 6) from velocities of the ends to relative ones along, and about, three axes
+    arms: Floats  #: (n, 2, 3) from the ends to where they are held together, as the first of them sees it [m]
     error: Floats  #: (n, 6) coordinates: translations [m] and turns [rad] of the second end relative to the first
     axes: Floats  #: (n, 3, 3) rows x, y, z in the world
+
+    @property
+    def rows(self) -> Floats:
+        """(n, 6, 2, 6) from velocities of the ends to relative ones along, and about, the three axes."""
+        out = np.zeros((len(self.axes), 6, 2, 6))
+        for k, sign in ((0, -1.0), (1, 1.0)):
+            out[:, :3, k, :3] = out[:, 3:, k, 3:] = sign * self.axes
+            out[:, :3, k, 3:] = sign * cross(self.arms[:, k, None], self.axes)
+        return out
 
 
 #: A function of positions (bodies, 3) [m] and quaternions (bodies, 4).

@@ -192,11 +192,8 @@ class Joint(Constraint):
             axes, d = axes_of(frame), place[:, 1] - place[:, 0]
             image = cell.whole(d)
             d -= image
-            out = np.zeros((len(row), 6, 2, 6))
-            for k, sign in ((0, -1.0), (1, 1.0)):
-                arm = place[:, 1] - (1 - k) * image - center[:, k]
-                out[:, :3, k, :3] = out[:, 3:, k, 3:] = sign * axes
-                out[:, :3, k, 3:] = sign * quaternion.cross(arm[:, None], axes)
-            return Geometry(out, np.concatenate([np.einsum("nij,nj->ni", axes, d), turns], axis=1), axes)
+            arms = place[:, 1:] - center
+            arms[:, 0] -= image
+            return Geometry(arms, np.concatenate([np.einsum("nij,nj->ni", axes, d), turns], axis=1), axes)
 
         return now

@@ -100,9 +100,9 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     count, every = len(ends.free), [part for _, members in parts for part in members]
     asked = [(n, *each) for n, part in enumerate(every) for each in part.conditions(found.error[n], dt)]
     which, ways, kind, t, bound = (np.array(column) for column in zip(*asked))
-    J = np.zeros((len(t), count, 6))
+    J, along = np.zeros((len(t), count, 6)), found.rows
     for side in (0, 1):
-        np.add.at(J, (np.arange(len(t)), row[which, side]), found.rows[which, ways, side])
+        np.add.at(J, (np.arange(len(t)), row[which, side]), along[which, ways, side])
     root = _roots(ends.inverse_mass)
     B = np.einsum("knx,nxy->kny", J, root).reshape(len(t), -1)
     now, velocity = J.reshape(len(t), -1) @ ends.velocity.ravel(), ends.free.copy()
