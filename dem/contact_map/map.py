@@ -21,7 +21,6 @@ from dem.contact_map import loops
 from dem.contact_map.halo import Halo, find_halo
 from dem.contact_map.mass import InverseMass
 from dem.contact_map.rows import BlockRows, CompactRows, checked, root_blocks
-from dem.quaternion import cross
 
 
 class ContactMap:
@@ -339,7 +338,7 @@ class ContactMap:
     def frame_blocks(self) -> Floats:
         """The blocks (nc, 2, 3, 6) of both bodies without their masses, and without the sign of the first."""
         frame, arms = self.given.frame.reshape(-1, 1, 3, 3), self.given.arm.reshape(-1, 2, 1, 3)
-        return np.concatenate(np.broadcast_arrays(frame, cross(arms, frame)), axis=3)
+        return np.concatenate(np.broadcast_arrays(frame, np.cross(arms, frame)), axis=3)
 
     def rows_of_blocks(self, blocks: Floats) -> BlockRows:
         """The rows that such blocks (nc, 2, 3, 6) make; collective."""
