@@ -52,6 +52,10 @@ class Bodies(Tabular):
         """The arrays by name, without copies."""
         return dict(vars(self))
 
+    def copy(self) -> Bodies:
+        """Another table of the same arrays."""
+        return Bodies(**vars(self))
+
     def take(self, rows: Ints | Bools | slice) -> Bodies:
         """The bodies of the given rows (index array, mask or slice)."""
         return Bodies(**{name: column[rows] for name, column in self.columns().items()})

@@ -91,12 +91,23 @@ def reduced(
     comm: MPI.Comm, sums: Sequence[float] | Floats, most: Sequence[float] | Floats
 ) -> tuple[list[float], list[float]]:
     """Some numbers summed over the ranks, and the greatest of some others, by one reduction. Collective."""
+    if comm.size == 1:
+        return list(map(float, sums)), list(map(float, most))
     numbers = np.array([len(sums), *sums, *most], float)
-    if comm.size > 1:
-        kind = MPI.DOUBLE.Create_contiguous(len(numbers)).Commit()  # so that MPI never cuts the numbers apart
-        comm.Allreduce(MPI.IN_PLACE, [numbers, 1, kind], _SUMS_AND_MOST)
-        kind.Free()
+    kind = MPI.DOUBLE.Create_contiguous(len(numbers)).Commit()  # so that MPI never cuts the numbers apart
+    comm.Allreduce(MPI.IN_PLACE, [numbers, 1, kind], _SUMS_AND_MOST)
+    kind.Free()
     return numbers[1 : len(sums) + 1].tolist(), numbers[len(sums) + 1 :].tolist()
+
+
+def told(comm: MPI.Comm, value: Out) -> Out:
+    """What the first rank has, on all ranks: processors may round in other ways. Collective."""
+    return value if comm.size == 1 else comm.bcast(value)
+
+
+def greatest(comm: MPI.Comm, value: Out) -> Out:
+    """The greatest value of all ranks; collective."""
+    return value if comm.size == 1 else comm.allreduce(value, MPI.MAX)
 
 
 def _sums_and_most(here: Any, everywhere: Any, kind: MPI.Datatype) -> None:

@@ -29,7 +29,7 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
         return velocity
     rows = gyroscopic(table)
     spin = velocity[rows, 3:]
-    velocity[rows, 3:], _ = free_spin(table.quaternion[rows], spin, table.inertia[rows], dt, np.zeros_like(spin))
+    velocity[rows, 3:], _ = free_spin(table.quaternion[rows], spin, table.inertia[rows], dt, np.zeros(spin.shape))
     return velocity
 
 
@@ -43,10 +43,10 @@ def fallen(table: Bodies, gravity: Floats, dt: float) -> tuple[Floats, int]:
 def velocity_changes(table: Bodies, impulse: Floats) -> Floats:
     """What impulses and angular impulses (n, 6) change of the velocities (n, 6) of bodies on which nothing else acts;
     zero where a mass or moment is infinite."""
-    change = np.empty_like(impulse)
+    change = np.empty(impulse.shape)
     change[:, :3] = impulse[:, :3] / table.mass[:, None]
     change[:, 3:] = impulse[:, 3:] / table.inertia  # of spheres
-    rows = np.flatnonzero(impulse[:, 3:].any(axis=1) & (table.shape != bodies.SPHERE))
+    rows = (impulse[:, 3:].any(axis=1) & (table.shape != bodies.SPHERE)).nonzero()[0]
     root = bodies.inverse_root_inertia(table.take(rows))
     change[rows, 3:] = (root @ (root @ impulse[rows, 3:, None]))[:, :, 0]
     return change
@@ -54,7 +54,7 @@ def velocity_changes(table: Bodies, impulse: Floats) -> Floats:
 
 def gyroscopic(table: Bodies) -> Ints:
     """The rows of bodies that turn freely and whose three moments are not equal."""
-    rows = np.flatnonzero(bodies.is_dynamic(table) & (table.shape != SPHERE))
+    rows = (bodies.is_dynamic(table) & (table.shape != SPHERE)).nonzero()[0]
     return rows[unequal(table.inertia[rows])]
 
 

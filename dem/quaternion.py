@@ -17,7 +17,7 @@ _TO_SCIPY, _FROM_SCIPY = [1, 2, 3, 0], [3, 0, 1, 2]
 
 def cross(a: Floats, b: Floats) -> Floats:
     """Cross product of vectors (..., 3); several times faster than `numpy.cross` on long arrays."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out = np.empty(np.broadcast(a, b).shape)
     out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
     out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
@@ -41,7 +41,7 @@ def multiply(p: Floats, q: Floats) -> Floats:
     """Hamilton product (..., 4): the rotation `q` followed by the rotation `p`."""
     pw, pv = p[..., :1], p[..., 1:]
     qw, qv = q[..., :1], q[..., 1:]
-    w = pw * qw - np.sum(pv * qv, axis=-1, keepdims=True)
+    w = pw * qw - (pv * qv).sum(axis=-1, keepdims=True)
     return np.concatenate([w, pw * qv + qw * pv + cross(pv, qv)], axis=-1)
 
 
@@ -64,7 +64,7 @@ def rotate(q: Floats, v: Floats) -> Floats:
 
 def matrix(q: Floats) -> Floats:
     """Rotation matrices (..., 3, 3) from the body frame to the world frame."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     out = np.empty(q.shape[:-1] + (3, 3))
     out[..., 0, 0] = 1 - 2 * (y * y + z * z)
     out[..., 0, 1] = 2 * (x * y - w * z)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import traceback
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -66,6 +67,7 @@ def meet(
     raise SceneError(f"the code of a scene must make the same calls on all ranks, but {listed}")
 
 
+@lru_cache(maxsize=1024)
 def digest(words: str) -> int:
     """A whole number of 60 bits that tells texts apart."""
     return int(hashlib.sha256(words.encode()).hexdigest()[:15], 16)

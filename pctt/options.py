@@ -11,7 +11,8 @@ import math
 import numbers
 import sys
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from typing import Any, TypeVar
 
 from dem.checks import nearest
@@ -74,7 +75,7 @@ def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "
 
     ``database`` maps names without the dash to strings, as `pctt.petsc.options_database` does.
     """
-    types, values = typing.get_type_hints(group), {}
+    types, values = _hints(group), {}
     for name, f in _named(group, prefix).items():
         if name in database:
             text, kind = database[name] or "", _kind(types[f.name])  # None stands for an option without a value
@@ -104,7 +105,7 @@ def _of_meaning(group: Any, words: str) -> str:
 
 def refuse_bad(group: Any) -> None:
     """OptionError for a value of a group, made in Python, that `read` would refuse, or that has another type."""
-    kinds = typing.get_type_hints(type(group))
+    kinds = _hints(type(group))
     for f in dataclasses.fields(group):
         value, kind = getattr(group, f.name), _kind(kinds[f.name])
         if value is not f.default and kind in _TYPES:
@@ -112,6 +113,8 @@ def refuse_bad(group: Any) -> None:
                 raise OptionError(f"{f.name} {value!r}: allowed is {_allowed(kind, f.metadata)}")
             _refuse(f"{f.name} {value}", value, kind, f.metadata)
 
+
+_hints: Callable[[Any], dict[str, Any]] = cache(typing.get_type_hints)
 
 #: What an option of each type may be in Python.
 _TYPES: dict[Any, type] = {int: numbers.Integral, float: numbers.Real, bool: bool, str: str}

@@ -6,6 +6,7 @@ the methods better puts the new numbers into the table.
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -99,6 +100,7 @@ MOST = {  # the sums, as counted
             "iterations": 1626, "cone problems": 100,
         },
     },
+    "calls": {"ten boxes": {"functions of Python": 146421}, "a pendulum": {"functions of Python": 105421}},
 }  # fmt: skip
 
 
@@ -286,10 +288,37 @@ def steps(patch: pytest.MonkeyPatch) -> Counter[str]:
     return counts
 
 
+def calls(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """What steps of few bodies call, as their seconds are those of calls: boxes that land on each other and come to
+    rest, and a pendulum. Later versions of Python and numpy call less."""
+    counts: Counter[str] = Counter()
+
+    boxes, pendulum = (Scene(friction=0.5) for _ in range(2))
+    boxes.add_body("floor", [Plane((0, 0, 1))])
+    boxes.add_boxes([[0.0, 0.1 * (k % 2), 0.11 + 0.21 * k] for k in range(10)], (0.1, 0.1, 0.1), 1000.0)
+    pendulum.add_spheres([[0.5, 0.0, 0.0]], 0.1, 1000.0)
+    pendulum.add_joint("pin", 0, kind="ball", anchor=(0.0, 0.0, 0.0))
+    for name, scene in (("ten boxes", boxes), ("a pendulum", pendulum)):
+        with pctt.Simulation(scene, dt=0.002, say=lambda _: None) as sim:
+            sim.copy().run(steps=60)  # so that loops are compiled
+            called: Counter[str] = Counter()
+            before = sys.getprofile()
+            sys.setprofile(lambda frame, event, argument, called=called: called.update((event,)))
+            try:
+                sim.run(steps=60)
+            finally:
+                sys.setprofile(before)
+            counts[f"{name}: functions of Python"] = called["call"]
+    return counts
+
+
 WALLS = [((1, 0, 0), (0, 0, 0)), ((-1, 0, 0), (0.84, 0, 0)), ((0, 1, 0), (0, 0, 0)), ((0, -1, 0), (0, 0.84, 0))]
 
 
-@pytest.mark.parametrize("group", [methods, systems, trains, preconditioners, steps], ids=lambda group: group.__name__)
+GROUPS = (methods, systems, trains, preconditioners, steps, calls)
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)
 def test_no_count_has_grown(group, monkeypatch):
     most = {f"{of}: {what}": count for of, row in MOST[group.__name__].items() for what, count in row.items()}
     options = PETSc.Options()

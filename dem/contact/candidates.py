@@ -92,7 +92,7 @@ def _of_grains(
     """Pairs of local grains with those in their rows, and with the `wanted` (parts,) parts of large bodies, of which a
     grain has `grown` (grains + ghosts,)."""
     first = near.grains + near.ghosts
-    part = first + np.flatnonzero(wanted)
+    part = first + wanted.nonzero()[0]
     turn = quaternion.matrix(table.quaternion[part]).reshape(-1, 9)
     turning, way = shifts[:, :, 3:].any(axis=(0, 2)), length(shifts[:, :, :3]).max(axis=0)
     grains, parts = Grains(rows.start, rows.other, near.margin, grown), Parts(part, table.row[part] - first, turn)

@@ -8,6 +8,7 @@ whether the margins meet now: it finds the same with the lists of an earlier ste
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import attrgetter, is_
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ class Lists:
     def hold(self, world: World, margin: Floats) -> bool:
         """Whether the lists of this rank have all pairs of these margins (grains,)."""
         margin = margin + world.cell.gone_since(self.cell)
-        same = all(then is now for then, now in zip(self.constant, _constant(world)))
+        same = all(map(is_, self.constant, _constant(world)))
         return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
 
 
@@ -86,8 +87,10 @@ def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
 
 
 def _constant(world: World) -> list[Any]:
-    names, tables = ("id", "mass", "inertia", "material", "shape", "size"), (world.grains, world.large)
-    return [*(getattr(table, name) for table in tables for name in names), *(b.shapes for b in world.large_bodies)]
+    return [*_COLUMNS(world.grains), *_COLUMNS(world.large), *(body.shapes for body in world.large_bodies)]
+
+
+_COLUMNS = attrgetter("id", "mass", "inertia", "material", "shape", "size")
 
 
 @loop

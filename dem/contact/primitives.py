@@ -201,7 +201,7 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
     pair, point, normal, gap, others = touch_spheres(
         table.kind, table.center, table.quaternion, table.size, i, j, delta
     )
-    found = [Manifold(pair, np.zeros_like(pair), Touch(point, normal, gap))]
+    found = [Manifold(pair, np.zeros(len(pair), np.int64), Touch(point, normal, gap))]
     if not len(others):
         return found[0]
     i, j, delta = i[others], j[others], delta[others]
@@ -209,9 +209,9 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
     guest, host = np.where(swap, j, i), np.where(swap, i, j)
     kind = np.where(table.kind >= POLYHEDRON, np.where(table.kind >= CONVEX, _CONVEX, _POLYHEDRON), table.kind)
     code = 8 * kind[guest] + kind[host]
-    for kinds in map(int, np.flatnonzero(np.bincount(code))):
+    for kinds in np.bincount(code).nonzero()[0].tolist():
         if divmod(kinds, 8) in _TOUCH:
-            rows = np.flatnonzero(code == kinds)
+            rows = (code == kinds).nonzero()[0]
             pair, feature, touch = _touching(table, divmod(kinds, 8), guest[rows], host[rows], delta[rows], course)
             touch.normal[swap[rows[pair]]] *= -1.0
             found.append(Manifold(others[rows[pair]], feature, touch))

@@ -140,7 +140,7 @@ def _margins(
     the shifts (k, large, 6) of the large bodies, by default those of the motion without contacts."""
     dt, velocity = (0.0, world.grains.velocity) if free is None else (free.dt, free.grains)
     if shifts is None:
-        shifts = (np.zeros_like(world.large.velocity) if free is None else dt * free.drives.free)[None]
+        shifts = (np.zeros(world.large.velocity.shape) if free is None else dt * free.drives.free)[None]
     way = ways(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
     way = way + world.cell.margin(dt, world.grains)
     return np.maximum(np.maximum(delta / 2, way), least), way, shifts
@@ -175,7 +175,7 @@ def _narrow(
 def _put_in_order(world: World, contacts: Contacts, pair: Ints, whole: bool) -> None:
     """Order the rows of the contacts of these pairs (nc,), unless the `whole` needs it only those from the first one on
     that has others behind it: shapes beside spheres come behind these, and touch in several points."""
-    back = np.flatnonzero(pair[1:] <= pair[:-1])
+    back = (pair[1:] <= pair[:-1]).nonzero()[0]
     if whole or len(back):
         first = 0 if whole else int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min()))
         left = slice(first, None)

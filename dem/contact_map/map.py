@@ -159,9 +159,9 @@ class ContactMap:
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
         """d'GG'd of this rank's bodies, for the step d that leads from this z to the x with the image ``new``."""
-        new_s, s, last_s = (x[self.halo.rows :] for x in (new, image, last))
-        energy = loops.energy_of_step(self.mass.alone, new, image, last, beta)
-        return energy + self.mass.energy(new_s - s - self.precision(beta) * (s - last_s))
+        first, energy = self.halo.rows, loops.energy_of_step(self.mass.alone, new, image, last, beta)
+        shared = image[first:]
+        return energy + self.mass.energy(new[first:] - shared - self.precision(beta) * (shared - last[first:]))
 
     def weights(self, H: Floats, symmetric: bool = True) -> Floats:
         """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""

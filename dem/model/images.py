@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from mpi4py import MPI
 
 from dem import bodies, quaternion
 from dem.arrays import Bools, Floats, Ints
+from dem.exchange import greatest, on_any
 from dem.model.neighbourhood import Neighbourhood, chunk_boxes, touched
 from dem.model.world import World
 from dem.parts.cell import Cell
@@ -33,7 +33,7 @@ def put_back(world: World) -> None:
     for row, body in enumerate(world.large_bodies):
         if wrong := cell.why_refused(body.name, body.motion, body.shapes, world.large.quaternion[row]):
             raise SceneError(wrong)
-    if world.comm.allreduce(cell.leaves(world.grains.position), MPI.LOR):
+    if on_any(world.comm, cell.leaves(world.grains.position))[0]:
         world.grains, world.lists = cell.inside(world.grains), None
 
 
@@ -43,7 +43,7 @@ def refuse_short(world: World, margin: Floats) -> None:
     if not world.cell.periodic:
         return
     reach = float((bodies.bounding_radius(world.grains) + margin).max(initial=0.0))
-    reach = world.comm.allreduce(reach, MPI.MAX)
+    reach = greatest(world.comm, reach)
     short = np.flatnonzero(world.cell.period <= 4.0 * reach)
     if len(short):
         raise SceneError(
@@ -68,7 +68,7 @@ class Images:
 
     def now(self, cell: Cell) -> Images:
         """The same where the shear and the size of the cell have brought them."""
-        return replace(self, way=cell.moved(self.steps, self.across))
+        return replace(self, way=cell.moved(self.steps, self.across)) if len(self) else self
 
     @cached_property
     def rows(self) -> Ints:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
@@ -72,13 +71,12 @@ class World:
     def trial(self) -> World:
         """A world that a step may change: this one stays as it is until it takes its state."""
         other = copy(self)
-        other.grains, other.large = dataclasses.replace(self.grains), dataclasses.replace(self.large)
+        other.grains, other.large = self.grains.copy(), self.large.copy()
         return other
 
     def take(self, trial: World) -> None:
         """Take the state to which a step has brought a trial."""
-        for name in STATE:
-            setattr(self, name, getattr(trial, name))
+        vars(self).update({name: vars(trial)[name] for name in STATE})
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Arrays from which `dem.start.restored_world` makes this world again: rows of local grains, and replicated

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -36,7 +37,7 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
     def doubt(self, radius: float) -> str:
         return "; ".join(filter(None, (law.doubt(self, radius) for law in LAWS)))
 
-    @property
+    @cached_property
     def acting(self) -> list[type[Law]]:
         """The laws that add something."""
         return [law for law in LAWS if law.acts(self)]
@@ -46,7 +47,7 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
         """How often a contact has three numbers: forces, and moments if contacts resist them."""
         return 2 if self.resists else 1
 
-    @property
+    @cached_property
     def columns(self) -> int:
         """How many numbers of a contact laws keep beside its impulses."""
         return sum(law.KEEPS for law in self.acting)
@@ -56,7 +57,7 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
         """Whether contacts of any pair resist rolling or spinning."""
         return self.moments() is not None
 
-    @property
+    @cached_property
     def attracts(self) -> bool:
         """Whether bodies of any pair attract each other."""
         return bool(self.strongest(np.ones(1)) > 0.0)
@@ -78,7 +79,7 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
         return friction
 
     def moments(self) -> tuple[Floats, Floats] | None:
-        return next((found for law in LAWS if (found := law.moments(self)) is not None), None)
+        return next((found for law in self.acting if (found := law.moments(self)) is not None), None)
 
     def keep(self, met: Met, kept: Floats, solved: Solved) -> Floats:
         found = [law.keep(self, met, column, solved) for law, column in self._each(kept) if law.KEEPS]

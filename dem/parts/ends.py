@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Union
 
@@ -12,6 +12,7 @@ from dem import checks
 from dem.arrays import Floats, Ints
 from dem.parts.cell import Cell
 from dem.parts.named import Named
+from dem.quaternion import cross
 
 HELD, MOTOR, LOWER, UPPER = range(4)  #: kinds of conditions: what is held, a motor, limits
 
@@ -45,9 +46,22 @@ class Tie(Named):
 class Geometry(NamedTuple):
     """n constraints as they are."""
 
-    rows: Floats  #: (n, 6, 2, 6) from velocities of the ends to relative ones along, and about, three axes
+    arms: Floats  #: (n, 2, 3) from the ends to where they are held together, as the first of them sees it [m]
     error: Floats  #: (n, 6) coordinates: translations [m] and turns [rad] of the second end relative to the first
     axes: Floats  #: (n, 3, 3) rows x, y, z in the world
+
+    @property
+    def rows(self) -> Floats:
+        """(n, 6, 2, 6) from velocities of the ends to relative ones along, and about, the three axes."""
+        out = np.zeros((len(self.axes), 6, 2, 6))
+        for k, sign in ((0, -1.0), (1, 1.0)):
+            out[:, :3, k, :3] = out[:, 3:, k, 3:] = sign * self.axes
+            out[:, :3, k, 3:] = sign * cross(self.arms[:, k, None], self.axes)
+        return out
+
+
+#: A function of positions (bodies, 3) [m] and quaternions (bodies, 4).
+Place = Callable[[Floats, Floats], Geometry]
 
 
 class Condition(NamedTuple):
@@ -64,12 +78,9 @@ class Constraint(Tie):
     contacts; see `dem.unconstrained.constraints`."""
 
     @classmethod
-    def geometry(
-        cls, members: Sequence[Any], row: Ints, position: Floats, orientation: Floats, cell: Cell
-    ) -> Geometry:
-        """Of n parts of the kind between bodies in the rows `row` (n, 2), with positions (bodies, 3) [m] and
-        quaternions (bodies, 4). The second ends are those images in the cell whose anchors are
-        nearest to the first ones."""
+    def geometry(cls, members: Sequence[Any], row: Ints, cell: Cell) -> Place:
+        """Of n parts of the kind between bodies in the rows `row` (n, 2) what their places make of them. The second
+        ends are those images in the cell whose anchors are nearest to the first ones."""
         raise NotImplementedError
 
     def conditions(self, error: Floats, dt: float) -> list[Condition]:

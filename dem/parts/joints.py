@@ -16,13 +16,13 @@ from dem import checks, quaternion
 from dem.arrays import Floats, Ints
 from dem.motion import Driven
 from dem.parts.cell import Cell
-from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Condition, Constraint, End, Geometry
+from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Condition, Constraint, End, Geometry, Place
 from dem.parts.named import Pressing
 
 
 def axes_of(frame: Floats) -> Floats:
     """The axes (n, 3, 3) of frames of quaternions (n, 4), as rows in the world."""
-    return np.stack([quaternion.rotate(frame, unit) for unit in np.eye(3)], axis=1)
+    return quaternion.rotate(frame[:, None], np.eye(3))
 
 
 def turned(one: Floats, other: Floats, relative: Floats) -> tuple[Floats, Floats]:
@@ -30,7 +30,7 @@ def turned(one: Floats, other: Floats, relative: Floats) -> tuple[Floats, Floats
     frames (n, 4) in their bodies, and the turn `relative` (n, 4) from one to the other: the rotation vector."""
     sine = quaternion.length(relative[:, 1:])
     angle = 2.0 * np.arctan2(sine, relative[:, 0])
-    return one, relative[:, 1:] * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 1e-12)[:, None]
+    return one, relative[:, 1:] * np.divide(angle, sine, out=np.full(len(sine), 2.0), where=sine > 1e-12)[:, None]
 
 
 def turned_about_z(one: Floats, other: Floats, relative: Floats) -> tuple[Floats, Floats]:
@@ -175,26 +175,25 @@ class Joint(Constraint):
         return found + [Condition(self.way, kind, (end - at) / dt) for kind, end in limits if np.isfinite(end)]
 
     @classmethod
-    def geometry(
-        cls, members: Sequence[Any], row: Ints, position: Floats, orientation: Floats, cell: Cell
-    ) -> Geometry:
+    def geometry(cls, members: Sequence[Any], row: Ints, cell: Cell) -> Place:
         anchors, frames = (np.array([getattr(joint, name) for joint in members]) for name in ("anchors", "frames"))
-        turn = [quaternion.normalized(quaternion.multiply(orientation[row[:, k]], frames[:, k])) for k in (0, 1)]
-        places = [position[row[:, k]] + quaternion.rotate(orientation[row[:, k]], anchors[:, k]) for k in (0, 1)]
-        relative = quaternion.multiply(quaternion.conjugate(turn[0]), turn[1])
-        relative = np.where(relative[:, :1] < 0.0, -relative, relative)
-        frame, turns = np.empty_like(relative), np.empty((len(relative), 3))
-        for kind in {joint.kind: None for joint in members}:
-            own = np.flatnonzero([joint.kind == kind for joint in members])
-            frame[own], turns[own] = KINDS[kind].turned(turn[0][own], turn[1][own], relative[own])
-        axes, d = axes_of(frame), places[1] - places[0]
-        image = cell.whole(d)
-        d -= image
-        error = np.concatenate([np.einsum("nij,nj->ni", axes, d), turns], axis=1)
-        out = np.zeros((len(members), 6, 2, 6))
-        for k, sign in ((0, -1.0), (1, 1.0)):
-            arm = places[1] - (1 - k) * image - position[row[:, k]]
-            out[:, :3, k, :3] = sign * axes
-            out[:, :3, k, 3:] = sign * np.cross(arm[:, None], axes)
-            out[:, 3:, k, 3:] = sign * axes
-        return Geometry(out, error, axes)
+        kinds = np.array([joint.kind for joint in members])
+        of_kind = [(KINDS[kind], (kinds == kind).nonzero()[0]) for kind in dict.fromkeys(kinds.tolist())]
+
+        def now(position: Floats, orientation: Floats) -> Geometry:
+            center, turn = position[row], orientation[row]
+            place, turn = center + quaternion.rotate(turn, anchors), quaternion.multiply(turn, frames)
+            turn = quaternion.normalized(turn)
+            relative = quaternion.multiply(quaternion.conjugate(turn[:, 0]), turn[:, 1])
+            relative = np.where(relative[:, :1] < 0.0, -relative, relative)
+            frame, turns = np.empty((len(row), 4)), np.empty((len(row), 3))
+            for kind, own in of_kind:
+                frame[own], turns[own] = kind.turned(turn[own, 0], turn[own, 1], relative[own])
+            axes, d = axes_of(frame), place[:, 1] - place[:, 0]
+            image = cell.whole(d)
+            d -= image
+            arms = place[:, 1:] - center
+            arms[:, 0] -= image
+            return Geometry(arms, np.concatenate([np.einsum("nij,nj->ni", axes, d), turns], axis=1), axes)
+
+        return now

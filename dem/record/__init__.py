@@ -16,7 +16,7 @@ from dem import bodies
 from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
-from dem.exchange import reduced
+from dem.exchange import reduced, told
 from dem.experiment import Experiment
 from dem.motion import Held
 from dem.start import stiffness
@@ -198,7 +198,7 @@ def energy_balance(step: Step) -> dict[str, float]:
         "impact_loss [J]": 0.0 - whole["normal"] - held,
         **({} if system.attraction is None else {"work_of_cohesion [J]": whole["attracted"]}),
         "time_stepping [J]": made,
-        "energy_jump [J]": comm.bcast(rise if jumps else 0.0),  # what follows from it must not differ between ranks
+        "energy_jump [J]": told(comm, rise if jumps else 0.0),  # what follows from it must not differ between ranks
     }
 
 
@@ -220,7 +220,7 @@ def works(
     velocities `before` (rows, 6), of all rows of `near`, and of those after the step [J]; and the normal velocities
     (nc,) of the latter; collective."""
     system, near = step.system, step.contacts.near
-    after = np.zeros_like(before)
+    after = np.zeros(before.shape)
     after[: near.grains] = step.world.grains.velocity
     system.contact_map.halo.update(after)
     after[near.grains + near.ghosts :] = step.world.large.velocity

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from mpi4py import MPI
 
 from dem import bodies
 from dem.arrays import Floats
+from dem.exchange import greatest
 from dem.model.world import World, turns_unlike_spheres
 from dem.scene import LargeBody
 from dem.shapes import Sphere
@@ -46,7 +46,7 @@ class TurnWatch:
         ids = np.concatenate([world.grains.id, world.large.id])
         row = int(np.argmax(speeds)) if len(speeds) else -1
         mine = (float(speeds[row]), int(ids[row])) if len(speeds) else (0.0, -1)
-        speed, id = world.comm.allreduce(mine, MPI.MAX)
+        speed, id = greatest(world.comm, mine)
         again = self._times + 1 if self._last in (-1, id) else 1
         self._times = again if dt * speed > SLACK * TURN else 0
         self._last = id

@@ -8,14 +8,13 @@ not those of the start of the step, and the grain may meet several bodies one af
 from __future__ import annotations
 
 import numpy as np
-from mpi4py import MPI
 
 from dem import bodies
 from dem.arrays import Bools, Floats, places
 from dem.bodies import SPHERE
 from dem.compiled import loop
 from dem.contact import Contacts, find_contacts, velocities_about
-from dem.exchange import on_any, reduced
+from dem.exchange import greatest, on_any, reduced
 from dem.model.world import World
 from dem.quaternion import cross, length
 from dem.step.system import contact_arms
@@ -70,7 +69,7 @@ def refuse_passages(
                 first = int(np.argmax(of[row]))
                 id = met.near.bodies.id[pair[row]]
                 worst = (float(of[row, first]), int(id[first]), int(id[1 - first]))
-        worst = world.comm.allreduce(worst, MPI.MAX)
+        worst = greatest(world.comm, worst)
         if worst[1] >= 0:
             raise SceneError(_refusal(world, worst, dt, furthest))
 

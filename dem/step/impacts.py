@@ -27,7 +27,7 @@ from dem.exchange import on_any
 from dem.geometry.vectors import cross, dot, plus
 from dem.model.world import World
 from dem.unconstrained import UnconstrainedMotion
-from dem.unconstrained.constraints import constrained
+from dem.unconstrained.constraints import slots
 
 #: Kinds of contacts: of two spheres, of a sphere that bounces from a body that forces do not move, and all others.
 PAIR, WALL, OTHER = 0, 1, 2
@@ -80,7 +80,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     grains, old = near.grains + near.ghosts, table.velocity
     ball = table.shape == SPHERE
     ball[grains:] = False
-    ball &= ~np.isin(table.id, constrained(world)[0])
+    ball[slots(world, table.id)[0]] = False
     if pairs.restitution.any():
         old = old.copy()
         old[grains:] = motion.prescribed

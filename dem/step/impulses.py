@@ -45,8 +45,8 @@ class ImpulseMemory:
             row, impulse = self._elsewhere(key[missing], self._key[left], self._impulse[left])
             place[missing[row]] = len(stored) + np.arange(len(row))
             stored = np.concatenate([stored, impulse])
-        ends = 4 * np.arange(1, self._parts + 1)
-        *each, columns = np.split(stored, ends, axis=1)
+        end = 4 * self._parts
+        each, columns = [stored[:, first : first + 4] for first in range(0, end, 4)], stored[:, end:]
         found = [in_frames(np.ascontiguousarray(part), place, frame) for part in each]
         kept = np.zeros((len(place), columns.shape[1]))
         kept[place >= 0] = columns[place[place >= 0]]

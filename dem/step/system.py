@@ -166,7 +166,7 @@ class ContactSystem:
         if push is None and turns_unlike_spheres(world):
             push = self.contact_map.momenta(self.net(last))
         if push is not None:
-            change = np.empty_like(push)
+            change = np.empty(push.shape)
             scale(self.contact_map.given.root, push, change)
             struck = self.dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
             push[struck], change[struck] = 0.0, 0.0
@@ -279,7 +279,7 @@ class ContactSystem:
 
     def velocity_with(self, momentum: Floats) -> Floats:
         """Velocities (owned, 6) after the step for the mass-scaled momenta G' g (owned, 6), in any shape."""
-        change = np.empty_like(self.free_velocity)
+        change = np.empty(self.free_velocity.shape)
         self.contact_map.mass.scale(momentum.reshape(-1, 6), change)
         return self.free_velocity + change
 
@@ -290,7 +290,7 @@ class ContactSystem:
             return None
         own = self.near.bodies.take(slice(len(velocity)))
         out = velocity.copy()
-        rows = np.flatnonzero(np.isfinite(self.middle[:, 0]))
+        rows = np.isfinite(self.middle[:, 0]).nonzero()[0]
         spins = velocity[rows, 3:], self.middle[rows]
         out[rows, 3:] = kept_spin(own.quaternion[rows], *spins, own.inertia[rows], self.dt)
         return out
@@ -312,7 +312,7 @@ class ContactSystem:
         """Impulses and angular impulses D g (large, 6) on the large bodies, the same on all ranks, from the impulses
         and the moments of `dem.step.resistance` (nc, 3) of all ranks [N s, N m s]; collective."""
         first = self.near.grains + self.near.ghosts
-        rows = np.flatnonzero(self.contact_map.body[:, 1] >= first)  # body b has the higher id
+        rows = (self.contact_map.body[:, 1] >= first).nonzero()[0]  # body b has the higher id
         sums = self.contact_map.sums_of_impulses(impulse, rows)
         if moment is not None and self.resistance is not None:
             self.resistance.map.sums_of_moments(moment, rows, sums)
@@ -360,7 +360,7 @@ def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> 
     row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
     arm = contact_arms(contacts, near.bodies.position, row)
     rows = CompactRows(frame.reshape(-1, 9), arm, body, inverse_root_masses(world, drives), owned)
-    ghosts = np.flatnonzero(touched)
+    ghosts = touched.nonzero()[0]
     index = near.index[ghosts]
     owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
     halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])

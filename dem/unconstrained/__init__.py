@@ -71,7 +71,7 @@ def large_velocity(world: World, free: UnconstrainedMotion, velocity: Floats) ->
     whose rows each rank owns; collective."""
     if not bodies.is_dynamic(world.large).any():
         return free.prescribed
-    large = np.zeros_like(world.large.velocity)
+    large = np.zeros(world.large.velocity.shape)
     count = len(world.grains)
     large[: len(velocity) - count] = velocity[count:]  # all of them on the last rank, none elsewhere
     world.comm.Bcast(large, root=world.comm.size - 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from mpi4py import MPI
@@ -47,7 +48,7 @@ def applied_impulses(world: World, dt: float, given: Floats) -> Applied | None:
     kinds = kinds_of(Force, world.named)
     if not kinds:
         return None
-    applied = Applied(dt, given, np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity))
+    applied = Applied(dt, given, np.zeros(world.grains.velocity.shape), np.zeros(world.large.velocity.shape))
     for kind, acting, members in kinds:
         memory = acting.act(members, world, applied)
         if memory is not None:
@@ -58,15 +59,18 @@ def applied_impulses(world: World, dt: float, given: Floats) -> Applied | None:
 def rows_of(world: World, parts: Iterable[Tie]) -> tuple[Ints, Ints]:
     """The ids of the grains at the ends of n parts, in order, and the rows (n, 2) of their ends among these, the large
     bodies and the world."""
-    ends = [end for part in parts for end in part.ends]
-    ids = np.unique([end for end in ends if isinstance(end, int)]).astype(np.int64)
+    return _rows_of(tuple(part.ends for part in parts), tuple(body.name for body in world.large_bodies))
 
-    def row(end: End) -> int:
-        if isinstance(end, int):
-            return int(np.searchsorted(ids, end))
-        return len(ids) + (len(world.large) if end is None else world.large_row(end))
 
-    return ids, np.array([row(end) for end in ends]).reshape(-1, 2)
+@lru_cache(maxsize=64)  # parts come and go with no step
+def _rows_of(ends: tuple[tuple[End, End], ...], large: tuple[str, ...]) -> tuple[Ints, Ints]:
+    grains = sorted({end for pair in ends for end in pair if isinstance(end, int)})
+    names = [*grains, *large, None]
+    row = {name: number for number, name in enumerate(names)}
+    return np.array(grains, np.int64), np.array([[row[end] for end in pair] for pair in ends]).reshape(-1, 2)
+
+
+COLUMNS = (0, 3, 7, 13, 19, 20, 29, 32, 35)  #: where what ranks tell of the grains at ends begins
 
 
 def ends_of(
@@ -83,7 +87,7 @@ def ends_of(
     gathered = np.zeros((len(ids), 35))
     gathered[np.searchsorted(ids, own.id)] = np.concatenate([*state, own.inertia, change[:, 3:]], axis=1)
     world.comm.Allreduce(MPI.IN_PLACE, gathered)  # each row is that of one rank
-    columns = np.split(gathered, np.cumsum([3, 4, 6, 6, 1, 9, 3]), axis=1)
+    columns = [gathered[:, first:end] for first, end in zip(COLUMNS, COLUMNS[1:])]
     position, turn, velocity, free, light, inverse_inertia, moments, pushes = columns
     tools = world.large
     change = velocity_changes(tools, large)

@@ -23,11 +23,13 @@ from mpi4py import MPI
 
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
+from dem.compiled import loop
+from dem.exchange import told
 from dem.free_motion import free_spin, unequal
 from dem.model.world import World
 from dem.motion import DROOP
 from dem.parts.cell import Cell
-from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Constraint, Ends, Geometry
+from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Constraint, Ends, Geometry, Place
 from dem.scene import kinds_of
 from dem.unconstrained.applied import Applied, ends_of, rows_of
 
@@ -71,12 +73,17 @@ class Coupling:
         return bool(((self.kind > MOTOR) | np.isfinite(self.bound)).any())
 
 
-def _geometry(parts: Kinds, row: Ints, position: Floats, turn: Floats, cell: Cell) -> Geometry:
+def _geometry(parts: Kinds, row: Ints, cell: Cell) -> Place:
     """Of the constraints of all kinds, see `Constraint.geometry`."""
     ends = np.cumsum([0, *(len(members) for _, members in parts)])
     rows = [row[first:end] for first, end in zip(ends, ends[1:])]
-    found = [kind.geometry(members, own, position, turn, cell) for (kind, members), own in zip(parts, rows)]
-    return Geometry(*(np.concatenate(each) for each in zip(*found)))
+    places = [kind.geometry(members, own, cell) for (kind, members), own in zip(parts, rows)]
+
+    def now(position: Floats, turn: Floats) -> Geometry:
+        found = [of_kind(position, turn) for of_kind in places]
+        return found[0] if len(found) == 1 else Geometry(*(np.concatenate(each) for each in zip(*found)))
+
+    return now
 
 
 def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> Coupling:
@@ -88,13 +95,14 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     momentum of bodies that are no spheres, and the errors of constraints at the end of the step. So they hold there, as
     in the method SHAKE, with forces of the start of the step, and energy does not drift (Hairer, Lubich, Wanner,
     "Geometric Numerical Integration", section VII.1.4)."""
-    row, found = ends.row, _geometry(parts, ends.row, ends.position, ends.quaternion, cell)
+    row, geometry = ends.row, _geometry(parts, ends.row, cell)
+    found = geometry(ends.position, ends.quaternion)
     count, every = len(ends.free), [part for _, members in parts for part in members]
     asked = [(n, *each) for n, part in enumerate(every) for each in part.conditions(found.error[n], dt)]
     which, ways, kind, t, bound = (np.array(column) for column in zip(*asked))
-    J = np.zeros((len(t), count, 6))
+    J, along = np.zeros((len(t), count, 6)), found.rows
     for side in (0, 1):
-        np.add.at(J, (np.arange(len(t)), row[which, side]), found.rows[which, ways, side])
+        np.add.at(J, (np.arange(len(t)), row[which, side]), along[which, ways, side])
     root = _roots(ends.inverse_mass)
     B = np.einsum("knx,nxy->kny", J, root).reshape(len(t), -1)
     now, velocity = J.reshape(len(t), -1) @ ends.velocity.ravel(), ends.free.copy()
@@ -103,7 +111,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     motors = np.isfinite(bound)
     slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
     on, given = kind <= MOTOR, np.zeros(len(t))
-    rows = np.flatnonzero(unequal(ends.moments))
+    rows = unequal(ends.moments).nonzero()[0]
     known = ends.quaternion[rows], ends.velocity[rows, 3:], ends.moments[rows]
     spin, middle = np.full((2, count, 3), np.nan)
     held, left = kind == HELD, t.copy()
@@ -128,7 +136,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
         if dt * np.abs(after[:, 3:]).max(initial=0.0) > FAR:
             break
         place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after[:, 3:], dt)
-        error = _geometry(parts, row, place, turn, cell).error
+        error = geometry(place, turn).error
         bent = (error - found.error)[which, ways] / dt - J.reshape(len(t), -1) @ after.ravel()
         t = np.where(held, left - bent, left)
     fixed = (J, B, root, which, ways, kind, t, bound, free, slip, found.axes)
@@ -155,7 +163,7 @@ def refound(known: Coupling, push: Floats) -> Coupling | None:
 def _impulses(A: Floats, t: Floats, free: Floats, on: Bools, given: Floats) -> Floats:
     """Impulses (k,) that bring the rows that hold to t; of the others the given ones."""
     g = given.copy()
-    g[on] = np.linalg.lstsq(A[np.ix_(on, on)], (t - free - A @ given)[on], rcond=1e-12)[0]
+    g[on] = np.linalg.lstsq(A[on][:, on], (t - free - A @ given)[on], rcond=1e-12)[0]
     return g
 
 
@@ -188,9 +196,9 @@ def _solved(
     g = _impulses(A, t, free, on, given)
     room = bound - np.abs(g)  # not positive where only contacts bring a motor to its speed: it is held there
     yields = np.isfinite(bound) & (room > 0.0)
-    e = np.divide(slip, room, out=np.zeros_like(slip), where=yields)
-    solver = np.zeros_like(A)
-    solver[np.ix_(on, on)] = np.linalg.pinv(A[np.ix_(on, on)] + np.diag(e[on]), rcond=1e-12, hermitian=True)
+    e = np.divide(slip, room, out=np.zeros(slip.shape), where=yields)
+    solver = np.zeros(A.shape)
+    solver[np.ix_(on, on)] = np.linalg.pinv(A[on][:, on] + np.diag(e[on]), rcond=1e-12, hermitian=True)
     value, vector = np.linalg.eigh(B.T @ solver @ B)
     K = (vector * (1.0 - np.sqrt(np.clip(1.0 - value, 0.0, 1.0)))) @ vector.T
     change = np.einsum("nxy,ny->nx", root, (B.T @ g).reshape(-1, 6))
@@ -222,31 +230,40 @@ def coupling_of(
     parts = _parts(world)
     if not parts:
         return None
-    grains, large = np.zeros_like(world.grains.velocity), np.zeros_like(world.large.velocity)
+    grains, large = np.zeros(world.grains.velocity.shape), np.zeros(world.large.velocity.shape)
     if applied is not None:
         grains, large = applied.grains, applied.large
     ends = ends_of(world, [part for _, members in parts for part in members], grains, large, given, dt)
-    gathered = np.zeros_like(ends.free)
+    gathered = np.zeros(ends.free.shape)
     if push is not None:
         id = np.concatenate([world.grains.id, world.large.id])[: len(push)]
         here, slot = slots(world, id)
         gathered[slot] = push[here]
         world.comm.Allreduce(MPI.IN_PLACE, gathered)
     found = coupling(parts, ends, dt, world.cell, gathered) if world.comm.rank == 0 else None
-    return world.comm.bcast(found)  # processors may round in other ways
+    return told(world.comm, found)
 
 
 def coupling_refound(world: World, known: Coupling, push: Floats) -> Coupling | None:
     """`refound`, by the first rank for all; collective."""
     found = refound(known, push) if world.comm.rank == 0 else None
-    return world.comm.bcast(found)
+    return told(world.comm, found)
 
 
 def slots(world: World, id: Ints) -> tuple[Ints, Ints]:
     """Which rows of bodies with these ids (n,) are among the bodies that constraints know, and their rows there."""
-    ids, first = constrained(world)[0], world.first_large
-    here = np.flatnonzero(np.isin(id, ids) | (id >= first))
-    return here, np.where(id[here] >= first, len(ids) + id[here] - first, np.searchsorted(ids, id[here]))
+    return _slots(constrained(world)[0], world.first_large, id)
+
+
+@loop
+def _slots(ids: Ints, first: int, id: Ints) -> tuple[Ints, Ints]:
+    here, slot, found = np.empty(len(id), np.int64), np.empty(len(id), np.int64), 0
+    for n in range(len(id)):
+        at = len(ids) + id[n] - first if id[n] >= first else np.searchsorted(ids, id[n])
+        if id[n] >= first or (at < len(ids) and ids[at] == id[n]):
+            here[found], slot[found] = n, at
+            found += 1
+    return here[:found].copy(), slot[:found].copy()
 
 
 def number_of(world: World, kind: str, name: str) -> int:
@@ -265,4 +282,4 @@ def constraints_now(world: World) -> tuple[Geometry, Floats]:
     tools = np.concatenate([large.position, large.quaternion, large.velocity], axis=1)
     rest = np.concatenate([np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], np.zeros((1, 6))], axis=1)
     position, turn, velocity = np.split(np.concatenate([gathered, tools, rest]), [3, 7], axis=1)
-    return _geometry(_parts(world), row, position, turn, world.cell), velocity[row]
+    return _geometry(_parts(world), row, world.cell)(position, turn), velocity[row]

@@ -43,8 +43,8 @@ class Drives:
 def drives_of(world: World, dt: float, given: Floats, pushed: Floats | None, spent: Ints) -> Drives:
     """The drives of the next step of dt [s], the same on all ranks; `given` (large, 6): the velocities that motions
     give, `pushed` (large, 6): impulses of loads and springs, None without any."""
-    table, impulse = world.large, np.zeros_like(world.large.velocity)
-    line, (grip, speed, most) = np.zeros_like(impulse), np.zeros((3, len(impulse)))
+    table, impulse = world.large, np.zeros(world.large.velocity.shape)
+    line, (grip, speed, most) = np.zeros(impulse.shape), np.zeros((3, len(impulse)))
     if not bodies.is_dynamic(table).any():
         return Drives(impulse, line, grip, speed, most, spent, given)
     free = falling = free_velocity(table, world.gravity, dt)
@@ -71,7 +71,7 @@ def given_velocities(world: World, poses: dict[int, Pose], dt: float) -> Floats:
     """The mean velocities (large, 6) over a step of dt [s] that motions give: to bodies that they prescribe those which
     lead to the `poses`, to others what they hold, zero where these are free; collective. SceneError if a motion
     fails."""
-    given = np.zeros_like(world.large.velocity)
+    given = np.zeros(world.large.velocity.shape)
     for row, end in poses.items():
         given[row] = velocity_between((world.large.position[row], world.large.quaternion[row]), end, dt)
 

@@ -131,7 +131,7 @@ def _by(
     name: str, problem: ConeProblem, guess: Array, limits: Limits, options: Any, newton: Newton | None, law: str
 ) -> Result:
     """What one method makes of the problem. Impulses that are no numbers become zero."""
-    method, nothing, coulomb = SOLVERS[name], np.zeros_like(problem.r), law == COULOMB
+    method, nothing, coulomb = SOLVERS[name], np.zeros(problem.r.shape), law == COULOMB
     cold = problem.natural_residual(nothing, problem.r, coulomb)
     if cold == 0:
         words = "no contact closes" if problem.size else "no contacts"
@@ -210,7 +210,7 @@ def _print(comm: MPI.Comm, iterations: int, residual: float) -> None:
 def _start(problem: ConeProblem, guess: Array | None) -> Array:
     """The guess in the cones (nc, 3), zero without one; ValueError on all ranks for another shape or if it is no
     number."""
-    none = np.zeros_like(problem.r)
+    none = np.zeros(problem.r.shape)
     start, wrong = problem.shown(none), ""
     try:
         start = start if guess is None else np.ascontiguousarray(guess, dtype=float)

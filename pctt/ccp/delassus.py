@@ -21,7 +21,7 @@ from dem.compiled import loop
 from dem.contact_map import BlockRows, ContactMap, Halo, find_halo, loops
 from dem.contact_map.map import shaped
 from dem.contact_map.rows import checked
-from dem.exchange import exchange, offsets
+from dem.exchange import exchange, offsets, on_any
 from pctt.blocks import Array, square_block_matrix
 
 DENSE = 500  # contacts of a body beyond which its columns of G are dense, and would fill N
@@ -114,7 +114,7 @@ class GivenMatrix(GivenOperator):
 
     def __init__(self, comm: MPI.Comm, N: PETSc.Mat | sp.bsr_matrix):
         self.local: sp.bsr_matrix = N if isinstance(N, sp.bsr_matrix) else rows_in_blocks(N)
-        if comm.allreduce(not np.isfinite(self.local.data).all(), MPI.LOR):
+        if on_any(comm, not np.isfinite(self.local.data).all())[0]:
             raise ValueError("N has a NaN or an infinite number")
         rows = len(self.local.indptr) - 1
         row, first = np.repeat(np.arange(rows), np.diff(self.local.indptr)), offsets(comm, rows)[comm.rank]

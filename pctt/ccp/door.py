@@ -83,7 +83,7 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: An
 
     |g_1 / mu_1, g_2 / mu_2| <= g_n is a circular cone of friction mu = max mu_k in the impulses g_k mu / mu_k. A
     contact of the plane has the friction 0 along its second tangent, in which nothing moves."""
-    kinds = [[kind_of(data.get(name)) == kind for kind in KINDS] for name in COLLECTIVE]
+    kinds = [kind_of(data.get(name)) for name in COLLECTIVE]
     N = data.pop("N", None)
     parts = 1 if cones is None else cones.parts
     if (mu is None) == (cones is None):
@@ -98,16 +98,17 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: An
     flat, space = velocity.ndim == 2 and velocity.shape[1] == 2, velocity.ndim == 2 and velocity.shape[1] == 3
     space = space or (velocity.ndim == 1 and velocity.size > 0)
     facts = bool(words), flat, space, friction.ndim == 2, parts == 1, parts > 1
-    wrong, plane, space, elliptic, plain, moments, *every = on_any(comm, *facts, *sum(kinds, []))
+    _, most = reduced(comm, (), (*facts, *kinds, *(-kind for kind in kinds)))
+    wrong, plane, spatial, elliptic, plain, moments, *every = map(int, most)
     if wrong:
         refuse(comm, words)
-    for k, name in enumerate(COLLECTIVE):
-        found = [kind for kind, there in zip(KINDS, every[k * len(KINDS) :]) if there]
-        if len(found) > 1:
-            raise ValueError(f"{name} is {' on some ranks, and '.join(found)} on others; allowed is one of them on all")
+    for name, last, first in zip(COLLECTIVE, every, every[len(kinds) :]):
+        if last != -first:
+            found = f"{KINDS[-first]} on some ranks, and {KINDS[last]} on others"
+            raise ValueError(f"{name} is {found}; allowed is one of them on all")
     if plain and moments:
         raise ValueError("cones have moments on some ranks, and none on others; allowed is one of both")
-    if plane and space:
+    if plane and spatial:
         raise ValueError("r has 2 columns on some ranks and 3 on others; allowed is one of both")
     width = 2 if plane else 3
     velocity, friction = np.ascontiguousarray(velocity.reshape(-1, width)), np.ascontiguousarray(friction)
@@ -123,17 +124,18 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: An
     return Contacts(width, units, units * velocity, most, velocity)
 
 
-def kind_of(given: Any) -> str:
-    """Which of KINDS a part of a problem's data is: ranks that take one for another would wait for each other."""
+def kind_of(given: Any) -> int:
+    """The number among KINDS of a part of a problem's data: ranks that take one for another would wait for each
+    other."""
     if given is None:
-        return KINDS[0]
+        return 0
     if isinstance(given, PETSc.Object):
-        return KINDS[1]
+        return 1
     if isinstance(given, (BlockRows, CompactRows, ContactMap)):
-        return KINDS[2]
+        return 2
     if callable(given) or isinstance(given, tuple) or hasattr(given, "mult") or hasattr(given, "solve"):
-        return KINDS[3]
-    return KINDS[4] if sp.issparse(given) or np.ndim(given) == 2 else KINDS[5]
+        return 3
+    return 4 if sp.issparse(given) or np.ndim(given) == 2 else 5
 
 
 def wrong_velocities(r: Any, shape: tuple[int, ...]) -> str:

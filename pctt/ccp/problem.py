@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -162,7 +163,7 @@ class ConeProblem:
         """Impulses (nc, 3) in the cones from the user's."""
         if self.units is None:
             return impulse
-        g = np.zeros_like(self.r)
+        g = np.zeros(self.r.shape)
         given = self.units[:, : self._width]
         np.divide(impulse, given, out=g[:, : self._width], where=given > 0.0)
         return g
@@ -178,7 +179,7 @@ class ConeProblem:
 
     def product(self, g: Array) -> Array:
         """N g for impulses g (nc, 3): velocities of the contacts (nc, 3)."""
-        y = np.zeros_like(self.r)
+        y = np.zeros(self.r.shape)
         self.operator.add_delassus(g, y)
         if self.yields:
             y += self.compliance * g
@@ -193,16 +194,15 @@ class ConeProblem:
         """G v: velocities of the contacts (nc, 3) for those of the bodies; N g where the problem is given by N."""
         return self.operator.velocities(momentum)
 
-    @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
     def errors(self, g: Array, y: Array, coulomb: bool = False, units: Array | None = None) -> Errors:
         """How far impulses g with the velocities y = N g + r are from a solution. For Coulomb's law y gets De Saxce's
         term. Both are multiplied by ``units`` (2, nc, 3), if these are given."""
         sums, most = self.cones.errors(g, y, self.r, 1.0 / self.mean_diagonal, coulomb, units)
         (moved, whole, closing, opening, energy), (speed,) = reduced(self.comm, sums, (most,))
-        natural = np.sqrt(moved) / np.sqrt(whole) if whole > 0.0 else np.inf
-        work = 0.0 if energy <= 0.0 else np.maximum(closing, opening) / energy
-        natural, work, speed = (float(x) if x == x else np.inf for x in (natural, work, speed))
-        return Errors(0.0 if moved == 0.0 else natural, work, speed)
+        natural = 0.0 if moved == 0.0 else math.sqrt(moved) / math.sqrt(whole) if whole > 0.0 else math.inf
+        most = closing if closing > opening or math.isnan(closing) else opening  # impulses may be no numbers
+        work = 0.0 if energy <= 0.0 else most / energy
+        return Errors(_number(natural), _number(work), _number(speed))
 
     def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
         """That of the `errors`."""
@@ -341,7 +341,7 @@ class ConeProblem:
         return self.sum(float(np.vdot(x, y)))
 
     def norm(self, x: Array) -> float:
-        return float(np.sqrt(self.dot(x, x)))
+        return math.sqrt(self.dot(x, x))
 
     def __enter__(self) -> ConeProblem:
         return self
@@ -373,6 +373,11 @@ def _with_both_tangents(given: Array) -> Array:
     for c in range(len(given)):
         out[c, 0], out[c, 1], out[c, 2] = given[c, 0], given[c, 1], given[c, 1]
     return out
+
+
+def _number(x: float) -> float:
+    """The same, inf if it is no number."""
+    return x if x == x else math.inf
 
 
 def _diagonals(blocks: Array) -> Array:

@@ -56,9 +56,11 @@ class Limits:
         """What ``tol`` is for: the natural residual, or the closing or opening work, or the closing speed, each in
         units in which its limit is ``tol``, whichever is largest. It is at most ENOUGH times the natural residual:
         where bodies are squeezed no accuracy may bring the others below their limits. What passes so is `squeezed`."""
-        pairs = (errors.work, self.closing_work), (errors.speed, self.closing_speed)
-        others = (self.tol / limit * error for error, limit in pairs if limit < math.inf)
-        return min(max([errors.natural, *others]), ENOUGH * errors.natural)
+        worst = errors.natural
+        for error, limit in (errors.work, self.closing_work), (errors.speed, self.closing_speed):
+            if limit < math.inf:
+                worst = max(worst, self.tol / limit * error)
+        return min(worst, ENOUGH * errors.natural)
 
     def squeezed(self, found: Accuracy, coulomb: bool) -> str:
         """The reason, in words, if impulses of this accuracy meet the limits although their closing or opening work, or
@@ -208,6 +210,8 @@ class Result:
 
     def after(self, *earlier: Result) -> Result:
         """This result, with what the results before it have cost."""
-        for count in ("iterations", "beyond", "ksp_its", "fallbacks", "newton_its"):
-            setattr(self, count, sum(getattr(result, count) for result in (self, *earlier)))
+        for result in earlier:
+            self.iterations, self.beyond = self.iterations + result.iterations, self.beyond + result.beyond
+            self.ksp_its, self.fallbacks = self.ksp_its + result.ksp_its, self.fallbacks + result.fallbacks
+            self.newton_its += result.newton_its
         return self

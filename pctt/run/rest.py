@@ -84,7 +84,7 @@ def _kinetic_part(world: World, system: ContactSystem) -> float:
     """The kinetic energy of the bodies over that which a step of free motion would give them; inf where a tool, a belt
     or a flow passes them faster than that. Collective."""
     grains, large, free = world.grains, world.large, system.free_large
-    moves = np.flatnonzero(bodies.is_dynamic(large))
+    moves = bodies.is_dynamic(large).nonzero()[0]
     driven = large.take(moves)
     first = float(world.comm.rank == 0)  # all ranks know the large bodies, and processors may round otherwise
     sums = (
@@ -123,7 +123,7 @@ def _passing(system: ContactSystem, tools: Floats) -> Floats:
     of a cell have at each contact."""
     at_contacts = [known for known in (system.surface, system.drift) if known is not None]
     if tools.any():
-        table = np.zeros_like(system.near.bodies.velocity)
+        table = np.zeros(system.near.bodies.velocity.shape)
         table[len(table) - len(tools) :] = tools
         at_contacts.append(system.contact_map.relative_velocities(table))
     most = np.zeros(len(system.contacts))

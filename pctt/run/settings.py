@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Optional
 
@@ -64,6 +65,9 @@ DEMO = {
     "overwrite": "true",  # nothing but the demo writes to its folder
     **DEMO_SOLVERS,
 }
+
+
+_LIMITS = attrgetter(*(field.name for field in dataclasses.fields(ccp.Limits)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,10 +133,8 @@ class Settings(ccp.Limits):
     @property
     def limits(self) -> ccp.Limits:
         """When the solver stops."""
-        given = {field.name: getattr(self, field.name) for field in dataclasses.fields(ccp.Limits)}
-        if given["closing_speed"] is None:
-            given["closing_speed"] = math.inf
-        return ccp.Limits(**given)
+        limits = ccp.Limits(*_LIMITS(self))
+        return limits if limits.closing_speed is not None else dataclasses.replace(limits, closing_speed=math.inf)
 
     @property
     def words(self) -> str:

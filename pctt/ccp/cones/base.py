@@ -47,8 +47,8 @@ class Cones(ABC):
         for name, values in self.named():
             if np.shape(values) != (self.count,):
                 return f"{name} has the shape {np.shape(values)}; allowed is {(self.count,)}, one for each contact"
-            bad = np.flatnonzero(~(np.isfinite(values) & (np.asarray(values) >= 0.0)))
-            if len(bad):
+            if not np.isfinite(values).all() or np.min(values, initial=0.0) < 0.0:
+                bad = np.flatnonzero(~(np.isfinite(values) & (np.asarray(values) >= 0.0)))
                 return f"{name} is {values[bad[0]]} at contact {bad[0]}; allowed are finite numbers >= 0"
         return ""
 

@@ -141,7 +141,7 @@ class ScaledProblem:
         if not every.operator.has_parts:
             return now, last, new, y
         faster = float(5 * length / np.sqrt(max(self.problem.size, 1)))
-        contacts = np.flatnonzero(self.cones.active(now.x, last.x, y, faster))
+        contacts = self.cones.active(now.x, last.x, y, faster).nonzero()[0]
         if len(contacts) > MANY * self.cones.count:
             return now, last, new, y
         rows = self.cones.rows_of(contacts)

@@ -95,7 +95,7 @@ def solve(
         newton.update(*linear.blocks(), symmetric=not coulomb)
         # affine step
         with phase("ConicPredictor"):
-            affine = linear.direction(newton, np.zeros_like(at.z))
+            affine = linear.direction(newton, np.zeros(at.z.shape))
         # centring: the further the affine step may go, the less (Mehrotra)
         target = max((1.0 - min(1.0, linear.reach(affine))) ** 3, options.least) * gap / conic.count
         with phase("ConicCorrector"):

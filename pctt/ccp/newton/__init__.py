@@ -20,9 +20,10 @@ from typing import Any, Union
 import numpy as np
 from mpi4py import MPI
 
+from dem.exchange import on_any
 from pctt.ccp.cones import Array
 from pctt.ccp.delassus import GivenMatrix
-from pctt.ccp.newton.by_elimination import ByElimination, eliminated
+from pctt.ccp.newton.by_elimination import ByElimination, has_few, matrix_of, order_of
 from pctt.ccp.newton.by_factors import ByFactors
 from pctt.ccp.newton.by_ksp import ByKSP
 from pctt.ccp.newton.compare import Comparison
@@ -64,13 +65,14 @@ class Newton:
         self._kind: tuple[str, bool] | None = None  # of the linear solver: of which form, and whether N has entries
         self._linear: Linear | None = None
         self._systems = 0
-        self._looked: tuple[Any, tuple[GivenMatrix, Order] | None] = (None, None)
+        self._seen: tuple[Any, tuple, Order | None] = (None, (), None)  # an operator, its structure and order
+        self._made: tuple[Any, GivenMatrix | None] = (None, None)  # an operator, and its matrix
 
     # -- the choice -------------------------------------------------------------------------------------------
 
     def _choose(self, problem: ConeProblem | None) -> None:
         """Take one of the three solvers for a problem, or for those that are to come; the last one if it will do."""
-        few = problem is not None and self._few(problem) is not None
+        few = problem is not None and self._look(problem)[1] is not None
         given = self.form == "body" and problem is not None and problem.contact_map is None
         entries = problem is None or problem.has_entries
         kind = "few" if few else "given" if given else self.form
@@ -102,13 +104,24 @@ class Newton:
 
     def has_elimination(self, problem: ConeProblem) -> bool:
         """Whether the systems of this problem are solved by elimination."""
-        return self._few(problem.by_rows()) is not None
+        return self._look(problem.by_rows())[1] is not None
 
-    def _few(self, problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:
-        """N and an order of elimination, if the contacts are few; that of the last problem is kept."""
-        if self._looked[0] is not problem.operator:
-            self._looked = (problem.operator, eliminated(problem) if self.own else None)
-        return self._looked[1]
+    def _look(self, problem: ConeProblem) -> tuple[tuple, Order | None]:
+        """The structure of a problem, and an order of elimination if its contacts are few. Both are those of the last
+        problem if the structures are equal."""
+        looked, structure, order = self._seen
+        if looked is not problem.operator:
+            found = problem.structure()
+            if not (len(found) == len(structure) and all(map(np.array_equal, found, structure))):
+                structure, order = found, order_of(self._matrix(problem)) if self.own and has_few(problem) else None
+            self._seen = problem.operator, structure, order
+        return structure, order
+
+    def _matrix(self, problem: ConeProblem) -> GivenMatrix | None:
+        """The N of few contacts; that of the last problem is kept."""
+        if self._made[0] is not problem.operator:
+            self._made = problem.operator, matrix_of(problem)
+        return self._made[1]
 
     def check(self, problem: ConeProblem) -> None:
         """ValueError if the problem is given by products, and the preconditioner reads entries."""
@@ -130,17 +143,16 @@ class Newton:
         joints or a cell couple bodies."""
         problem = problem.by_rows()
         self._choose(problem)
-        few = self._few(problem)
-        self.problem = problem if few is None else problem.by_matrix(few[0])
-        structure, last = problem.structure(), self._structure or ()
-        same = len(structure) == len(last) and all(map(np.array_equal, structure, last))
+        structure, order = self._look(problem)
+        N = None if order is None else self._matrix(problem)
+        self.problem = problem if N is None else problem.by_matrix(N)
         self.linear.begin()
-        if problem.comm.allreduce(same, op=MPI.LAND):
+        if not on_any(problem.comm, structure is not self._structure)[0]:
             self.system.load(self.problem)
         else:
             given = self.form == "body" and problem.contact_map is None
             form = FORMS["contact" if given else self.form]
-            self._take(form(problem) if few is None else GivenForm(self.problem, few[1]), structure)
+            self._take(form(problem) if order is None else GivenForm(self.problem, order), structure)
         return self.problem
 
     def _take(self, system: System, structure: tuple | None) -> None:

@@ -22,20 +22,25 @@ PAIRS = 100_000  # pairs of blocks in an elimination at most: 20 ns each
 REST = 133  # contacts in the dense rest at most: 1 ms
 
 
-def eliminated(problem: ConeProblem) -> tuple[GivenMatrix, Order] | None:
-    """N and an order of elimination of a problem on one rank; None if it has many contacts, or none is cheap."""
-    if not (problem.comm.size == problem.cones.parts == 1 and problem.size <= FEW and problem.has_entries):
-        return None
+def has_few(problem: ConeProblem) -> bool:
+    """Whether an order of elimination is looked for."""
+    return problem.comm.size == problem.cones.parts == 1 and problem.size <= FEW and problem.has_entries
+
+
+def matrix_of(problem: ConeProblem) -> GivenMatrix | None:
+    """N of few contacts without compliance; None if it is full."""
     if isinstance(problem.operator, GivenMatrix):
-        known = problem.operator
-    else:
-        assert problem.contact_map is not None
-        G = problem.contact_map.block_rows
-        if np.square(np.bincount(G.indices)).sum() > 2 * PAIRS + len(G.indices):
-            return None
-        known = GivenMatrix(problem.comm, all_blocks(G))
-    order = ordered(known.local.indptr, known.local.indices, PAIRS, REST)
-    return None if order is None else (known, order)
+        return problem.operator
+    assert problem.contact_map is not None
+    G = problem.contact_map.block_rows
+    if np.square(np.bincount(G.indices)).sum() > 2 * PAIRS + len(G.indices):
+        return None
+    return GivenMatrix(problem.comm, all_blocks(G))
+
+
+def order_of(N: GivenMatrix | None) -> Order | None:
+    """An order of elimination; None if none is cheap."""
+    return None if N is None else ordered(N.local.indptr, N.local.indices, PAIRS, REST)
 
 
 class ByElimination:

@@ -65,7 +65,7 @@ class Factors:
         self.N, self.order, self.diagonal = N, order, diagonal
         #: lower blocks, and the transposes of the upper ones; the diagonal is in the first
         self._lower = np.zeros((order.head + len(order.rows) + order.rest**2, 3, 3))
-        self._upper = self._lower if symmetric else np.zeros_like(self._lower)
+        self._upper = self._lower if symmetric else np.zeros(self._lower.shape)
         _place((N.indptr, N.indices, N.data, diagonal), order.columns(), self._lower, self._upper)
         _eliminate(order.head, order.starts, order.target, self._lower, self._upper, symmetric)
         if order.rest:
@@ -85,7 +85,7 @@ class Factors:
     def solve(self, b: Array, wanted: float) -> tuple[Array, int]:
         """x (nc, 3) with |b - S x| at most ``wanted``, refined where it must be, and the solves that this took; 0 if it
         was not reached."""
-        x, left, change, order = np.zeros_like(b), b.copy(), np.empty_like(b), self.order
+        x, left, change, order = np.zeros(b.shape), b.copy(), np.empty(b.shape), self.order
         given = order.columns(), self._lower
         S = self.N.indptr, self.N.indices, self.N.data, self.diagonal
         for count in range(1, ROUNDS + 1):
