@@ -198,7 +198,8 @@ def main() -> None:
             table.add(row | ratios, f"{name}: {rows['auto']['what'][:60]}")
     said = verdict(found)
     print("\n".join(said))
-    record("drawn_kernels", about, [{"verdict": said}, *({"number": name, "ways": rows} for name, rows in found.items())])
+    rows = [{"number": name, "ways": ways} for name, ways in found.items()]
+    record("drawn_kernels", about, [{"verdict": said}, *rows])
 
 
 if __name__ == "__main__":

@@ -113,6 +113,8 @@ def why_not(way: str, given: System) -> str:
         return "entries do not depend on differences"
     if way == "nystrom" and not given.nugget:
         return "no nugget"
+    if way == "jacobi" and given.a is not None and given.block == 1:
+        return "the diagonal is constant"
     return ""
 
 
@@ -135,9 +137,9 @@ class Counting:
 def solve(given: System, way: str, rank: str | None = None) -> Row:
     """CG to RTOL of the true residual: seconds, iterations, products, what was used, and of which residual it ended.
 
-    Products are those with the matrix, by trials and by the solution, and applications of the preconditioner, as much
-    as their operations are of a product; NaN where these are not known. Iterations are those of the KSP and, where
-    `TensorTrain` has let CG alone go in turns with it, of both.
+    Iterations are those that the KSP tells. Products are those with the matrix, by trials, by the solution and by CG
+    alone where `TensorTrain` has let it go in turns with the KSP, and applications of the preconditioner, as much as
+    their operations are of a product; NaN where these are not known.
     """
     context = Counting(given.product())
     mat = PETSc.Mat().create(PETSc.COMM_SELF)
@@ -176,8 +178,8 @@ def solve(given: System, way: str, rank: str | None = None) -> Row:
             ours = ksp.pc.getPythonContext()
             made, applied = ours.made, ours.apply
             what = made.words() if ours.rank > 1 else "block Jacobi"
-            shown = getattr(made.transform, "promise", None)  # of parts of the grid; other trials multiply by the matrix
-            trials = tried + (0.0 if shown is None else shown.spent)
+            parts = getattr(made.transform, "promise", None)  # of the grid; other trials multiply by the matrix
+            trials = tried + (0.0 if parts is None else parts.spent)
             each = made.promise.each if made.promise is not None else 0.0 if ours.rank == 1 or way == "auto" else np.nan
 
             def apply(pc: PETSc.PC, r: PETSc.Vec, z: PETSc.Vec) -> None:
@@ -191,7 +193,7 @@ def solve(given: System, way: str, rank: str | None = None) -> Row:
     good = ksp.getConvergedReason() > 0 and left < 3 * RTOL
     row: Row = {"setup_s": middle - begin, "solve_s": end - middle, "residual": left, "trials": trials, "what": what}
     row["warned"] = "; ".join(str(w.message) for w in said)
-    row["iterations"] = max(ksp.getIterationNumber(), context.count - 1) if good else inf
+    row["iterations"] = ksp.getIterationNumber() if good else inf
     row["products"] = context.count + trials + each * inner.count if good else inf
     if way == "auto" and "conjugate gradients alone take" in "\n".join(ours.report()):
         row["what"] += ", LEFT"
