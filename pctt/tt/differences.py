@@ -38,6 +38,7 @@ SHARES = ((1 / 100, 1024), (1 / 40, 4096))
 LEAST, FEWEST, ROWS = 64, 24, 3  # points, if they are a fortieth of all; in any case; rows along a periodic axis
 NEARLY = 0.05  # a periodic function may change so much in a period
 PART = 0.2  # points of all trials, over those of a solution: as many kinds are tried
+PAIR = 0.33  # points of both parts, over all, with which two kinds are tried in any case
 SLACK = 1.3  # a preconditioner that costs so many times more than another one on a part is not tried further
 MOST = 1000.0  # products that a trial may cost
 UNTRIED = [1.0, 0.5]  # norms that stand for those of a trial
@@ -381,10 +382,11 @@ def choose(a: Differences) -> Choice | None:
     scores: dict[Kind, float] = {}
     trials: list[_Trial] = []
     alone, spent = [1.0], 0.0
-    for share, most in SHARES:
-        pieces = parts(a, min(share, most / prod(a.shape)))
+    for few, most in SHARES:
+        pieces = parts(a, min(few, most / prod(a.shape)))
         points = sum(prod(part.shape) for part in pieces)
-        kinds = kinds[: max(1, int(PART * prod(a.shape) / points))]
+        share = points / prod(a.shape)
+        kinds = kinds[: max(2 if share <= PAIR else 1, int(PART / share))]
         if len(kinds) == 1 or (scores and pieces[0].shape == trials[0].shape):
             break
         trials = []
