@@ -20,7 +20,7 @@ from pctt.tt.differences import CIRCULANT, COSTS, Differences, FastInverse
 
 Array = np.ndarray
 Product = Callable[[Array], Array]
-RTOL, MOST = 1e-8, 4000  # of the true residual; iterations
+RTOL = 1e-8  # of the true residual
 COLUMNS, BLOCK = 200, 20  # of Nystrom's approximation, in all and at a time
 TOO_MANY = 1.3  # times what the better of CG alone and the circulant takes
 #: The ways to solve, and their heads in tables.
@@ -134,7 +134,7 @@ class Counting:
     apply = mult
 
 
-def solve(given: System, way: str, rank: str | None = None) -> Row:
+def solve(given: System, way: str, rank: str | None = None, most: int = 4000) -> Row:
     """CG to RTOL of the true residual: seconds, iterations, products, what was used, and of which residual it ended.
 
     Iterations are those that the KSP tells. Products are those with the matrix, by trials, by the solution and by CG
@@ -154,7 +154,7 @@ def solve(given: System, way: str, rank: str | None = None) -> Row:
     ksp.setOperators(mat)
     ksp.setType("cg")
     ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-    ksp.setTolerances(rtol=RTOL, max_it=MOST)
+    ksp.setTolerances(rtol=RTOL, max_it=most)
     x, b = mat.createVecs()
     b.array[:] = np.random.default_rng(0).standard_normal(given.size)
     each, trials, what, inner = EACH.get(way, np.nan), 0.0, "", Counting(lambda r: r)

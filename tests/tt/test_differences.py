@@ -158,7 +158,7 @@ def test_the_best_share_is_chosen() -> None:
     t = 2 - 2 * np.cos(2 * np.pi * np.arange(512) / 512)
     fractional = np.fft.irfft2((t[:, None] + t[:257]) ** 0.7)[:160, :160]
     a = of.Differences.of_even(fractional)
-    assert count(a, of.choose(a).kind) <= 1.25 * min(count(a, kind) for kind in (of.COSINE, of.CIRCULANT, *of.MORE))
+    assert count(a, of.choose(a).kind) <= 1.25 * min(count(a, kind) for kind in (of.COSINE, of.SINE, of.CIRCULANT, *of.MORE))
 
 
 @pytest.mark.parametrize("a", [[1.0, 2.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0]])
