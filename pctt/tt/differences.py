@@ -170,6 +170,13 @@ class Differences:
             found.append(float(np.abs(here - back)[1:].max(initial=0.0) / largest))
         return found
 
+    def steepness(self, axis: int) -> float:
+        """How much a(s), s not 0, changes at most between neighbours on this axis, relative to the largest a(s)."""
+        values = np.moveaxis(self.values, axis, 0)[: self.shape[axis]]
+        steps = np.abs(np.diff(values, axis=0))
+        steps[(slice(1),) * len(self.shape)] = 0.0
+        return float(steps.max(initial=0.0) / (np.abs(values[1:]).max(initial=0.0) or 1.0))
+
     def distance(self, transform: str) -> float:
         """Of A from the nearest matrix that a "cosine", a "sine" or a "circulant" diagonalises, over the size of A, in
         Frobenius' norm. That matrix is a projection of A, so the squares of both distances add up."""
@@ -343,10 +350,11 @@ def parts(a: Differences, share: float) -> list[Differences]:
     of the means of cells of points (times the root of their number).
 
     The first shows how a behaves near zero, the second how it does far from it, on the whole grid. Periodic axes stay
-    whole, if they are short enough. A small grid is no smaller part.
+    whole, if they are short enough and not constant. A small grid is no smaller part.
     """
     shape, size = a.shape, prod(a.shape)
     whole = [far <= NEARLY and ROWS * n <= size / 30 for n, far in zip(shape, a.aperiodic)]
+    whole = [all_ and a.steepness(axis) > NEARLY for axis, all_ in enumerate(whole)]
     if all(whole):
         whole = [False] * len(shape)
     rows = ROWS * prod(n for n, all_ in zip(shape, whole) if all_) if any(whole) else 0
