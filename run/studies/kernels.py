@@ -325,8 +325,8 @@ def write_page(found: dict[str, dict[str, Row]], said: dict[str, list[str]], abo
 
 
 TEXT = """`run/study kernels` writes this section: CG to a true residual of {rtol:g}, the same matrices and right
-sides in every column. Cells have CPU seconds of set-up and solution (iterations), or what {most} iterations left; one thread
-of an {cpu}, commit {commit}. The fastest is bold. "auto" is `TensorTrain` by its defaults, block
+sides in every column. Cells have CPU seconds of set-up and solution (iterations), or what {most} iterations left; one
+thread of an {cpu}, commit {commit}. The fastest is bold. "auto" is `TensorTrain` by its defaults, block
 Nystrom has {columns} columns. Jacobi is as CG alone: diagonals are constant.
 
 {table}
