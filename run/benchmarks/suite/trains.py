@@ -9,7 +9,7 @@ from solutions import solve
 
 
 class Kernel:
-    """A line of 16,384 points, a square of 128^2 and a cube of 32^3; `TensorTrain` by its defaults, as a train of rank
+    """A line of 4,096 points, a square of 64^2 and a cube of 16^3; `TensorTrain` by its defaults, as a train of rank
     100 at most, and no preconditioner."""
 
     params = (["imq1", "exp02", "yukawa50"], ["auto", "train", "plain"])
