@@ -406,7 +406,7 @@ def choose(a: Differences) -> Choice | None:
         alone = max((alone, *(trial.runs[NOTHING].norms for trial in trials if NOTHING in trial.runs)), key=at_least)
         costs = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}  # the harder part counts
         scores = {kind: cost * max(1.0, cost / scores.get(kind, cost)) for kind, cost in costs.items()}
-        lead = 1.0 if a.even else max(1.0, nearer / _nearer(pieces))
+        lead = 1.0 if a.even else max(1.0, nearer / _nearer(pieces)) ** 1.5
         order = {kind: scores[kind] / (lead if kind == CIRCULANT else 1.0) for kind in kinds}
         kinds = sorted(kinds, key=lambda kind: order[kind])
         kinds = [kind for kind in kinds if order[kind] <= SLACK * order[kinds[0]]]
