@@ -328,7 +328,8 @@ def write_page(found: dict[str, dict[str, Row]], said: dict[str, list[str]], abo
 TEXT = """`run/study kernels` writes this section: CG to a true residual of {rtol:g}, the same matrices and right
 sides in every column. Cells have CPU seconds of set-up and solution (iterations), or what {most} iterations left; one
 thread of an {cpu}, commit {commit}. The fastest is bold. "auto" is `TensorTrain` by its defaults, block
-Nystrom has {columns} columns. Jacobi is as CG alone: diagonals are constant.
+Nystrom has {columns} columns. Jacobi is as CG alone: diagonals are constant. Systems are small, so that all take
+minutes; trials and set-up of "auto" take 0.03 to 0.08 s here, which pays for larger ones.
 
 {table}
 
