@@ -333,7 +333,8 @@ minutes; trials and set-up of "auto" take 0.03 to 0.08 s here, which pays for la
 
 {table}
 
-Products are those with the matrix, trials included; preconditioners count by their operations. Iterations are the KSP's own.
+Products are those with the matrix, trials included; preconditioners count by their operations.
+Iterations are the KSP's own.
 
 {said}
 
