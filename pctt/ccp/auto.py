@@ -71,7 +71,7 @@ def solve(
     first = tried.apgd(guess, begun)
     if first.converged and first.residual > limits.aimed:
         tried.beyond(guess, few)
-    elif not first.final and begun < limits.max_it:
+    elif not (first.final or first.exhausted) and begun < limits.max_it:
         if not coulomb:
             settings = conic.Conic()
             tried.conic(first.impulse, replace(settings, start=min(settings.start, options.start * first.residual)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import inf, log10
+from math import ceil, inf, log10
 
 import numpy as np
 
@@ -78,16 +78,19 @@ class ConjugateGradients:
 
 
 def iterations(norms: Sequence[float], digits: float = DIGITS) -> float:
-    """The number of iterations that gain these digits, extrapolated where the norms (k + 1,) have not gained them.
+    """The number of iterations that gain these digits, between two norms (k + 1,); extrapolated where they have not.
 
     >>> iterations([1.0, 0.1, 0.001], 2), iterations([1.0, 0.1, 0.01], 4)
-    (2.0, 4.0)
+    (1.5, 4.0)
     """
     found = at_least(norms, digits)
     gained = log10(norms[0] / min(norms)) if min(norms) > 0 else inf
-    if gained >= digits:
+    if gained < digits:
+        return found * digits / gained if gained > 0 else inf
+    if found == 0 or norms[found] == 0:
         return float(found)
-    return found * digits / gained if gained > 0 else inf
+    before, after = (log10(norms[0] / norms[k]) for k in (found - 1, found))
+    return found - (after - digits) / (after - before)
 
 
 def at_least(norms: Sequence[float], digits: float = DIGITS) -> int:
@@ -150,7 +153,7 @@ class Promise:
     @property
     def iterations(self) -> int:
         """That gain eight digits."""
-        return int(min(iterations(self.norms), 1e9))
+        return ceil(min(iterations(self.norms), 1e9))
 
     def cost(self, digits: float) -> float:
         """Of a solution to these digits with the preconditioner, in products."""

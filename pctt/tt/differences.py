@@ -31,17 +31,17 @@ from scipy import fft
 from pctt.tt.conjugate import ConjugateGradients, Promise, at_least, race
 from pctt.tt.train import Array
 
+EPSILON = float(np.finfo(float).eps)
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
 #: Shares of the points of a grid, and the most points, on which solutions are tried: all, then the best of them.
 SHARES = ((1 / 100, 1024), (1 / 40, 4096))
 LEAST, FEWEST, ROWS = 64, 24, 3  # points, if they are a fortieth of all; in any case; rows along a periodic axis
 NEARLY = 0.05  # a periodic function may change so much in a period
 PART = 0.2  # points of all trials, over those of a solution: as many kinds are tried
+PAIR = 0.33  # points of both parts, over all, with which two kinds are tried in any case
 SLACK = 1.3  # a preconditioner that costs so many times more than another one on a part is not tried further
-SMALL, LEAD = 512, 2.0  # points of parts that show a circulant worse than it is, if a kernel is not even; how much
 MOST = 1000.0  # products that a trial may cost
 UNTRIED = [1.0, 0.5]  # norms that stand for those of a trial
-EASY = 3.0  # condition with which a small matrix needs no preconditioner
 
 #: What is tried: the transforms of which the mean of the inverses is taken, and their shares.
 Kind = tuple[tuple[str, float], ...]
@@ -49,12 +49,11 @@ NOTHING: Kind = ()
 BLOCK_DIAGONAL: Kind = (("block diagonal", 1.0),)
 CIRCULANT: Kind = (("circulant", 1.0),)
 COSINE: Kind = (("cosine", 1.0),)
-#: In the order in which they are tried if few can be: for kernels that are even in each coordinate, and for others.
-EVEN: tuple[Kind, ...] = (
-    COSINE, NOTHING, CIRCULANT, (("cosine", 0.5), ("sine", 0.5)), (("cosine", 0.75), ("sine", 0.25)),
-    (("sine", 1.0),), (("embedding", 1.0),), BLOCK_DIAGONAL,
+SINE: Kind = (("sine", 1.0),)
+#: What is tried after these, if so many can be.
+MORE: tuple[Kind, ...] = (
+    (("cosine", 0.5), ("sine", 0.5)), (("cosine", 0.75), ("sine", 0.25)), (("embedding", 1.0),),
 )  # fmt: skip
-ODD: tuple[Kind, ...] = (CIRCULANT, NOTHING, COSINE, *EVEN[3:])
 #: The cost of an application; that of a product with A is 1.
 COSTS = {"block diagonal": 0.0, "circulant": 0.25, "cosine": 0.25, "sine": 0.25, "embedding": 1.0}
 WORDS = {
@@ -171,6 +170,26 @@ class Differences:
             found.append(float(np.abs(here - back)[1:].max(initial=0.0) / largest))
         return found
 
+    def steepness(self, axis: int) -> float:
+        """How much a(s), s not 0, changes at most between neighbours on this axis, relative to the largest a(s)."""
+        values = np.moveaxis(self.values, axis, 0)[: self.shape[axis]]
+        steps = np.abs(np.diff(values, axis=0))
+        steps[(slice(1),) * len(self.shape)] = 0.0
+        return float(steps.max(initial=0.0) / (np.abs(values[1:]).max(initial=0.0) or 1.0))
+
+    def distance(self, transform: str) -> float:
+        """Of A from the nearest matrix that a "cosine", a "sine" or a "circulant" diagonalises, over the size of A, in
+        Frobenius' norm. That matrix is a projection of A, so the squares of both distances add up."""
+        squares = self.values**2
+        for n in self.shape:
+            s = np.abs(self._signed(n))
+            squares = np.tensordot((n - s) * (1 + (self.even & (s > 0))), squares, 1)
+        if transform == "circulant":
+            near = prod(self.shape) * (self.circulant() ** 2).sum()
+        else:
+            near = (eigenvalues(self, transform)[0] ** 2).sum()
+        return float(max(1 - near / squares.sum(), EPSILON) ** 0.5)
+
     def means(self) -> Array:
         """The means (n_1, ..., n_D, b, b) over the signs of the coordinates."""
         values = self.values
@@ -236,7 +255,6 @@ class FastInverse:
     kind : of the mean, one of CANDIDATES
 
     positive : whether all eigenvalues are positive; if not, neither is A
-    condition : the largest eigenvalue of the nearest matrices over the smallest
     name : in words
 
     >>> a = Differences.of_even(0.3 ** np.arange(6.0))
@@ -247,7 +265,6 @@ class FastInverse:
 
     def __init__(self, a: Differences, kind: Kind) -> None:
         self.kind, self.shape, self.block, self.positive = kind, a.shape, a.block, True
-        self.condition = 1.0
         self.each = sum(COSTS[transform] for transform, _ in kind)
         self.name = " and ".join(WORDS[transform] for transform, _ in kind) or "no preconditioner"
         if len(kind) == 2:
@@ -255,9 +272,8 @@ class FastInverse:
         self._factors: list[tuple[str, Array]] = []
         for transform, share in kind:
             values, least = eigenvalues(a, transform)
-            inverse, positive, condition = _inverse(values, least)
+            inverse, positive = _inverse(values, least)
             self.positive &= positive
-            self.condition = max(self.condition, condition)
             self._factors.append((transform, share * inverse))
 
     def solve(self, x: Array) -> Array:
@@ -304,9 +320,8 @@ def _along_last(a: Array, kind: str) -> Array:
     return (even - odd)[..., :n] if kind == "cosine" else (even + odd)[..., 1:]
 
 
-def _inverse(values: Array, bound: float | None) -> tuple[Array, bool, float]:
-    """The inverses of Hermitian blocks (..., b, b), whether all are positive, and the condition of all. Less than a
-    bound counts as it."""
+def _inverse(values: Array, bound: float | None) -> tuple[Array, bool]:
+    """The inverses of Hermitian blocks (..., b, b), and whether all are positive. Less than a bound counts as it."""
     if values.shape[-1] == 1:
         vectors, values = None, values[..., 0]
     else:
@@ -314,10 +329,9 @@ def _inverse(values: Array, bound: float | None) -> tuple[Array, bool, float]:
     largest = float(values.max())
     positive = largest > 0 and (bound is not None or values.min() > -FLOOR * largest)
     values = np.maximum(values, max(bound or 0.0, FLOOR * abs(largest)) or 1.0)
-    condition, inverse = float(values.max() / values.min()), 1 / values
     if vectors is None:
-        return inverse[..., None], bool(positive), condition
-    return (vectors * inverse[..., None, :]) @ np.conj(np.swapaxes(vectors, -1, -2)), bool(positive), condition
+        return 1 / values[..., None], bool(positive)
+    return (vectors / values[..., None, :]) @ np.conj(np.swapaxes(vectors, -1, -2)), bool(positive)
 
 
 # -- the choice ----------------------------------------------------------------------------------------------
@@ -336,10 +350,11 @@ def parts(a: Differences, share: float) -> list[Differences]:
     of the means of cells of points (times the root of their number).
 
     The first shows how a behaves near zero, the second how it does far from it, on the whole grid. Periodic axes stay
-    whole, if they are short enough. A small grid is no smaller part.
+    whole, if they are short enough and not constant. A small grid is no smaller part.
     """
     shape, size = a.shape, prod(a.shape)
     whole = [far <= NEARLY and ROWS * n <= size / 30 for n, far in zip(shape, a.aperiodic)]
+    whole = [all_ and a.steepness(axis) > NEARLY for axis, all_ in enumerate(whole)]
     if all(whole):
         whole = [False] * len(shape)
     rows = ROWS * prod(n for n, all_ in zip(shape, whole) if all_) if any(whole) else 0
@@ -362,20 +377,23 @@ def choose(a: Differences) -> Choice | None:
     """The preconditioner with which conjugate gradients cost least; None if A is not positive definite.
 
     It is found on small parts of the grid, and on larger ones if some are hardly worse; as many are tried as cost PART
-    of a solution. Costs that have grown count as if they grew once more up to the whole. If there is no such part, the
-    first of the kinds is taken, or none for a well-conditioned matrix.
+    of a solution, the nearest in Frobenius' norm first. Costs that have grown count as if they grew once more up to the
+    whole. Few points of a kernel that is not even show a circulant worse than it is, by about as much as it is nearer
+    to the whole, beside a cosine transform. If there is no such part, the nearest is taken.
     """
     if max(a.aperiodic) <= 1e-12:  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
         return Choice(CIRCULANT, Promise(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
-    kinds = [kind for kind in (EVEN if a.even else ODD) if a.block > 1 or kind != BLOCK_DIAGONAL]
+    first, *others = sorted((COSINE, CIRCULANT, SINE), key=lambda kind: a.distance(kind[0][0]))
+    kinds, nearer = [first, NOTHING, *others, *MORE, *[BLOCK_DIAGONAL] * (a.block > 1)], _nearer([a])
     scores: dict[Kind, float] = {}
     trials: list[_Trial] = []
     alone, spent = [1.0], 0.0
-    for share, most in SHARES:
-        pieces = parts(a, min(share, most / prod(a.shape)))
+    for few, most in SHARES:
+        pieces = parts(a, min(few, most / prod(a.shape)))
         points = sum(prod(part.shape) for part in pieces)
-        kinds = kinds[: max(1, int(PART * prod(a.shape) / points))]
+        share = points / prod(a.shape)
+        kinds = kinds[: max(2 if share <= PAIR else 1, int(PART / share))]
         if len(kinds) == 1 or (scores and pieces[0].shape == trials[0].shape):
             break
         trials = []
@@ -388,8 +406,8 @@ def choose(a: Differences) -> Choice | None:
         alone = max((alone, *(trial.runs[NOTHING].norms for trial in trials if NOTHING in trial.runs)), key=at_least)
         costs = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}  # the harder part counts
         scores = {kind: cost * max(1.0, cost / scores.get(kind, cost)) for kind, cost in costs.items()}
-        lead = {CIRCULANT: LEAD} if not a.even and points < SMALL else {}
-        order = {kind: scores[kind] / lead.get(kind, 1.0) for kind in kinds}
+        lead = 1.0 if a.even else max(1.0, nearer / _nearer(pieces)) ** 1.5
+        order = {kind: scores[kind] / (lead if kind == CIRCULANT else 1.0) for kind in kinds}
         kinds = sorted(kinds, key=lambda kind: order[kind])
         kinds = [kind for kind in kinds if order[kind] <= SLACK * order[kinds[0]]]
     found = kinds[0]
@@ -397,10 +415,15 @@ def choose(a: Differences) -> Choice | None:
         inverse = FastInverse(a, found)
         if not inverse.positive:
             return None
-        easy = inverse.condition < EASY
-        return Choice(NOTHING if easy else found, Promise(0.0 if easy else inverse.each, UNTRIED, alone))
+        return Choice(found, Promise(inverse.each, UNTRIED, alone))
     hard = max(trials, key=lambda trial: trial.costs[found])
     return Choice(found, Promise(hard.runs[found].each, hard.runs[found].norms, alone, spent / prod(a.shape)))
+
+
+def _nearer(pieces: Sequence[Differences]) -> float:
+    """How far the nearest matrices of a cosine transform are, over how far circulants are."""
+    far, near = (sum(part.distance(transform) for part in pieces) for transform in ("cosine", "circulant"))
+    return far / near
 
 
 class _Trial:

@@ -6,26 +6,21 @@ Two thirds depend on differences of points of grids of one to three dimensions: 
 seasonal, band-limited or of short range, spectra, sums and products of these, with a nugget, several unknowns a point.
 Others are on grids with holes, graded or scattered points, with noise or weights that vary, of lengths that vary, of
 low rank, or classical (Hilbert, Cauchy). A product counts 1, an application of a preconditioner as much as its
-operations are of a product. A ratio is what auto takes to what the better of CG alone and the circulant does.
+operations are of a product; columns of Nystrom's approximation are not counted. Ratios, of products and of iterations
+alone, are what auto takes to what the better of CG alone and the circulant does. Writes results/drawn_kernels.json.
 """
 
 from __future__ import annotations
 
-import warnings
-from math import prod
+from math import inf
 
 import numpy as np
-import petsc4py
-
-petsc4py.init([])
-from petsc4py import PETSc
 from scipy import special
-from shared import Row, Table, parser
+from shared import Row, Table, parser, record, say_machine
+from solutions import Array, System, ratio, solve, verdict, why_not
 
-from pctt.tt.differences import CIRCULANT, COSTS, Differences, FastInverse
+from pctt.tt.differences import Differences
 
-Array = np.ndarray
-RTOL, MOST = 1e-8, 4000
 GRIDS = {1: (300, 9000), 2: (18, 150), 3: (8, 28)}  # sides, from and to
 DENSE = 1600  # points without a fast product
 
@@ -108,47 +103,26 @@ def function(rng: np.random.Generator, s: Array) -> Array:
 # -- matrices -------------------------------------------------------------------------------------------------
 
 
-class Drawn:
-    """Kernel ``number``: its ``entries`` on a ``grid`` with ``block`` unknowns a point, and its product."""
-
-    def __init__(self, number: int) -> None:
-        rng = np.random.default_rng([2026, number])
-        self.a: Differences | None = None
-        self.block = 1
-        if number % 3 == 2:
-            self.words, dense = without_differences(rng)
-            dense[np.diag_indices_from(dense)] += nugget(rng) * np.diag(dense).mean()
-            self.grid: tuple[int, ...] = (len(dense),)
-            self.entries, self.times = lambda i, j: dense[i, j], lambda v: dense @ v
-            self.dense = True
-            return
-        d = int(rng.choice([1, 2, 2, 2, 3, 3]))
-        least, most = GRIDS[d]
-        self.grid = tuple(int(n) for n in np.exp(rng.uniform(np.log(least), np.log(most), d)))
-        axes = [np.concatenate([np.arange(n), np.arange(1 - n, 0)]).astype(float) for n in self.grid]
-        s = np.array(np.meshgrid(*axes, indexing="ij"))
-        self.block = int(rng.choice([1, 1, 1, 1, 2, 3]))
-        values = function(rng, s)[..., None, None]
-        if self.block > 1:
-            parts = rng.standard_normal((2, self.block, self.block))
-            values = values * (parts[0] @ parts[0].T) + function(rng, s)[..., None, None] * (parts[1] @ parts[1].T)
-        zero = (0,) * d
-        size = np.trace(values[zero]) / self.block
-        values[zero] += nugget(rng) * size * np.eye(self.block)
-        self.a = a = Differences(self.grid, values).compact()
-        self.words, self.times, self.dense = f"{' x '.join(map(str, self.grid))}, {self.block}", a.times, False
-        b = self.block
-
-        def entries(i: Array, j: Array) -> Array:
-            x, y = (np.unravel_index(k // b, self.grid) for k in (i, j))
-            apart = [np.abs(u - v) if a.even else u - v for u, v in zip(x, y)]
-            return a.values[(*apart, i % b, j % b)]
-
-        self.entries = entries
-
-    @property
-    def size(self) -> int:
-        return prod(self.grid) * self.block
+def drawn(number: int) -> tuple[System, str]:
+    """Kernel ``number``, and what it is in words."""
+    rng = np.random.default_rng([2026, number])
+    if number % 3 == 2:
+        words, dense = without_differences(rng)
+        dense[np.diag_indices_from(dense)] += nugget(rng) * np.diag(dense).mean()
+        return System((len(dense),), lambda i, j: dense[i, j], lambda v: dense @ v), words
+    d = int(rng.choice([1, 2, 2, 2, 3, 3]))
+    least, most = GRIDS[d]
+    grid = tuple(int(n) for n in np.exp(rng.uniform(np.log(least), np.log(most), d)))
+    axes = [np.concatenate([np.arange(n), np.arange(1 - n, 0)]).astype(float) for n in grid]
+    s = np.array(np.meshgrid(*axes, indexing="ij"))
+    block = int(rng.choice([1, 1, 1, 1, 2, 3]))
+    values = function(rng, s)[..., None, None]
+    if block > 1:
+        parts = rng.standard_normal((2, block, block))
+        values = values * (parts[0] @ parts[0].T) + function(rng, s)[..., None, None] * (parts[1] @ parts[1].T)
+    zero = (0,) * d
+    values[zero] += nugget(rng) * np.trace(values[zero]) / block * np.eye(block)
+    return System.of(Differences(grid, values).compact()), f"{' x '.join(map(str, grid))}, {block}"
 
 
 def nugget(rng: np.random.Generator) -> float:
@@ -197,78 +171,6 @@ def without_differences(rng: np.random.Generator) -> tuple[str, Array]:
     return kind, A
 
 
-# -- solutions ------------------------------------------------------------------------------------------------
-
-
-class Counting:
-    """A Mat or a PC that multiplies by a function."""
-
-    def __init__(self, times) -> None:
-        self.times, self.count = times, 0
-
-    def mult(self, mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.count += 1
-        y.array_w[:] = self.times(x.array_r)
-
-    apply = mult
-
-
-def solve(given: Drawn, way: str, rank: str = "auto") -> Row:
-    """CG to RTOL of the true residual: products, trials, what an application costs, and what was used."""
-    context, sizes = Counting(given.times), (given.size, given.size)
-    mat = PETSc.Mat().create(PETSc.COMM_SELF)
-    mat.setSizes(sizes, given.block)
-    mat.setType(PETSc.Mat.Type.PYTHON)
-    mat.setPythonContext(context)
-    mat.setUp()
-    mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-    mat.setAttr("entries", given.entries)
-    mat.setAttr("grid", given.grid)
-    ksp = PETSc.KSP().create(PETSc.COMM_SELF)
-    ksp.setOperators(mat)
-    ksp.setType("cg")
-    ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-    ksp.setTolerances(rtol=RTOL, max_it=MOST)
-    x, b = mat.createVecs()
-    b.array[:] = np.random.default_rng(0).standard_normal(given.size)
-    each, trials, what, applied = 0.0, 0.0, "", [0]
-    if way == "alone":
-        ksp.pc.setType("none")
-    elif way == "circulant":
-        ksp.pc.setType("python")
-        ksp.pc.setPythonContext(inner := Counting(FastInverse(given.a, CIRCULANT).solve))
-        each = COSTS["circulant"]
-    else:
-        PETSc.Options()["pc_tt_rank"] = rank
-        ksp.pc.setType("python")
-        ksp.pc.setPythonType("pctt.pc.TensorTrain")
-        ksp.setFromOptions()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            ksp.setUp()
-        inner = ksp.pc.getPythonContext()
-        made = inner.made
-        what = made.words() if inner.rank > 1 else "block Jacobi"
-        if made.promise is not None:
-            each = made.promise.each
-        tried = getattr(made.transform, "promise", made.promise)  # of parts of the grid; others multiply by the matrix
-        trials = 0.0 if given.dense or tried is None else tried.spent
-        apply = inner.apply
-        inner.apply = lambda *given: (applied.append(1), apply(*given))[1]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        ksp.solve(b, x)
-    if way == "circulant":
-        applied = [inner.count]
-    left = float(np.linalg.norm(given.times(x.array_r) - b.array_r) / b.norm())
-    good = ksp.getConvergedReason() > 0 and left < 3 * RTOL
-    cost = context.count + trials + each * sum(applied)
-    row = {"iterations": ksp.getIterationNumber(), "products": cost if good else np.inf, "trials": trials, "what": what}
-    if way == "auto" and "conjugate gradients alone take" in "\n".join(inner.report()):
-        row["what"] += ", LEFT"
-    return row
-
-
 def main() -> None:
     words = parser("drawn_kernels", __doc__)
     words.add_argument("first", nargs="?", type=int, default=0)
@@ -277,29 +179,27 @@ def main() -> None:
     words.add_argument("-rank", default="auto", help="-pc_tt_rank")
     words.add_argument("-worst", type=float, default=0.0, help="only rows with a larger ratio")
     asked = words.parse_args()
+    about = say_machine()
     table = Table(
         kernel=("number", "6d"), alone=("alone", "7.0f"), circulant=("circulant", "9.1f"), trials=("trials", "6.1f"),
-        auto=("auto", "7.1f"), ratio=("ratio", "6.2f"), what=("what", "<"),
+        auto=("auto", "7.1f"), products=("products", "8.2f"), iterations=("iterations", "10.2f"), what=("what", "<"),
     )  # fmt: skip
-    ratios: dict[int, float] = {}
+    found: dict[str, dict[str, Row]] = {}
     for number in range(asked.first, asked.last):
-        given = Drawn(number)
-        if asked.name not in given.words:
+        given, name = drawn(number)
+        if asked.name not in name:
             continue
-        alone = solve(given, "alone")["products"]
-        circulant = solve(given, "circulant")["products"] if given.a else np.inf
-        auto = solve(given, "auto", asked.rank)
-        best = min(alone, circulant)
-        ratio = auto["products"] / best if np.isfinite(best) else 0.0
-        ratios[number] = ratio
-        if ratio >= asked.worst:
-            row = {"number": number, "alone": alone, "circulant": circulant, "auto": auto["products"], "ratio": ratio}
-            table.add(row | {"trials": auto["trials"], "what": ""}, f"{given.words}: {auto['what'][:60]}")
-    found = np.array(list(ratios.values()))
-    print(
-        f"{len(found)} kernels: fewer products than the better in {(found < 1).sum()}, more than 1.3 times as many in "
-        f"{(found > 1.3).sum()}, at most {found.max():.2f} times (kernel {list(ratios)[int(found.argmax())]})"
-    )
+        ways = [way for way in ("plain", "circulant", "auto") if not why_not(way, given)]
+        rows = found[str(number)] = {way: solve(given, way, asked.rank) for way in ways}
+        ratios = {figure: ratio(rows, figure) for figure in ("iterations", "products")}
+        if max(ratios.values()) >= asked.worst:
+            row = {"number": number, "alone": rows["plain"]["products"], "auto": rows["auto"]["products"], "what": ""}
+            row |= {"circulant": rows["circulant"]["products"] if given.a else inf, "trials": rows["auto"]["trials"]}
+            table.add(row | ratios, f"{name}: {rows['auto']['what'][:60]}")
+    said = verdict(found)
+    print("\n".join(said))
+    rows = [{"number": name, "ways": ways} for name, ways in found.items()]
+    record("drawn_kernels", about, [{"verdict": said}, *rows])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draws tables of docs as figures, so that both say the same: docs/cluster.png, docs/kernels.png.
+"""Draws the table of docs/cluster.md as a figure, so that both say the same: docs/cluster.png.
 
     run/study table_plots
 """
@@ -41,15 +41,6 @@ def cluster(axes: Any) -> None:
     axes.set(xscale="log", yscale="log", xlabel="ranks", ylabel="ms of a step, by the model")
 
 
-def kernels(axes: Any) -> None:
-    """Seconds of set-up and solution of each way, for each kernel."""
-    heads, rows = table("trains.md", "| kernel, CG to 1e-8 |")
-    for k, mark in enumerate("oxsvd*", 1):
-        axes.plot([seconds(row[k]) for row in rows], range(len(rows))[::-1], mark, label=heads[k])
-    axes.set_yticks(range(len(rows))[::-1], [row[0] for row in rows], fontsize=7)
-    axes.set(xscale="log", xlabel="CPU s of set-up and solution; missing: not solved in 60 s")
-
-
 if __name__ == "__main__":
     parser("table_plots", __doc__).parse_args()
     import matplotlib
@@ -57,10 +48,9 @@ if __name__ == "__main__":
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    for draw in (cluster, kernels):
-        figure, axes = plt.subplots(figsize=(7, 4.4), layout="constrained")
-        draw(axes)
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
-        figure.savefig(DOCS / f"{draw.__name__}.png", dpi=100)
-        print(DOCS / f"{draw.__name__}.png")
+    figure, axes = plt.subplots(figsize=(7, 4.4), layout="constrained")
+    cluster(axes)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)
+    figure.savefig(DOCS / "cluster.png", dpi=100)
+    print(DOCS / "cluster.png")

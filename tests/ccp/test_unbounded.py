@@ -267,3 +267,19 @@ def test_the_curvature_is_looked_for_once_for_all_load_steps():
 
 def diagonal(N):
     return [N[3 * c : 3 * c + 3, 3 * c : 3 * c + 3] for c in range(len(N) // 3)]
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+@pytest.mark.parametrize("solver", ["auto", "apgd"])
+def test_steps_meet_a_negative_direction_that_lanczos_has_missed(solver, seed):
+    rng = np.random.default_rng(seed)
+    values = 10.0 ** rng.uniform(-6, 0, 300)
+    values[:2] = 1.0, -0.08
+    Q = np.linalg.qr(rng.standard_normal((300, 300)))[0]
+    N = (Q * values) @ Q.T
+    given = ccp.Operator(lambda g: (N @ g.ravel()).reshape(-1, 3), np.array(diagonal(N)))
+    problem = ccp.ConeProblem(SELF, rng.normal(size=(100, 3)), np.full(100, 0.5), N=given)
+    problem._curvature.append(0.0)
+    result = ccp.solve(problem, type=solver, law=ccp.RELAXATION)
+    assert result.status in (Status.BREAKDOWN, Status.UNBOUNDED)
+    assert "N is indefinite" in result.reason

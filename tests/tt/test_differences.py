@@ -158,7 +158,42 @@ def test_the_best_share_is_chosen() -> None:
     t = 2 - 2 * np.cos(2 * np.pi * np.arange(512) / 512)
     fractional = np.fft.irfft2((t[:, None] + t[:257]) ** 0.7)[:160, :160]
     a = of.Differences.of_even(fractional)
-    assert count(a, of.choose(a).kind) <= 1.25 * min(count(a, kind) for kind in of.EVEN if kind)
+    kinds = of.COSINE, of.SINE, of.CIRCULANT, *of.MORE
+    assert count(a, of.choose(a).kind) <= 1.25 * min(count(a, kind) for kind in kinds)
+
+
+@pytest.mark.parametrize(("n", "power"), [(48, 0.65), (57, 0.8)])
+def test_a_small_laplacian_has_a_sine_transform(n: int, power: float) -> None:
+    t = 2 - 2 * np.cos(2 * np.pi * np.arange(512) / 512)
+    a = of.Differences.of_even(np.fft.irfft2((t[:, None] + t[:257]) ** power)[:n, :n])
+    assert count(a, of.choose(a).kind) <= 0.6 * count(a, of.CIRCULANT)
+
+
+def test_parts_show_a_function_of_one_coordinate() -> None:
+    """The others are not periodic axes that have to stay whole: parts would be half of the points, or lines."""
+    season = np.exp(-2 * np.sin(np.pi * np.arange(13) / 7.3) ** 2)
+    values = np.broadcast_to(season[:, None, None], (13, 16, 18)).copy()
+    values[0, 0, 0] += 0.3
+    a = of.Differences.of_even(values)
+    for part in of.parts(a, 0.01):
+        assert min(part.shape) > 2
+        assert np.prod(part.shape) <= 0.1 * values.size
+    found = of.choose(a).kind
+    assert count(a, found) <= 1.3 * min(count(a, of.NOTHING), count(a, of.CIRCULANT))
+
+
+def test_distances_are_those_of_the_nearest_matrices() -> None:
+    rng = np.random.default_rng(5)
+    a = of.Differences((4, 5), rng.standard_normal((7, 9, 2, 2)))
+    A = dense(a)
+    for transform in ("cosine", "sine"):
+        Q = np.kron(np.kron(basis(4, transform), basis(5, transform)), np.eye(2))
+        blocks = (Q @ A @ Q.T).reshape(20, 2, 20, 2)
+        blocks[range(20), :, range(20)] = 0.0
+        assert a.distance(transform) == pytest.approx(np.linalg.norm(blocks) / np.linalg.norm(A))
+    near = np.take(np.take(a.circulant(), np.r_[:4, -3:0], 0), np.r_[:5, -4:0], 1)
+    apart = np.linalg.norm(A - dense(of.Differences((4, 5), near)))
+    assert a.distance("circulant") == pytest.approx(apart / np.linalg.norm(A))
 
 
 @pytest.mark.parametrize("a", [[1.0, 2.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0]])

@@ -97,6 +97,7 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
             if not (length > 0 and curvature > allowed):  # also ends on a number that is none
                 break
             lipschitz = options.margin * curvature / length
+        progress.watch(curvature, length, lipschitz)
         step = lipschitz**2 * length
         if uphill > 0 or (coulomb and step > options.growth * least):
             theta, beta, least = options.theta, 0.0, np.inf

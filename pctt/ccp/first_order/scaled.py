@@ -14,7 +14,7 @@ from pctt.ccp.cones import Array, Cones
 from pctt.ccp.delassus import GivenOperator
 from pctt.ccp.problem import ConeProblem, Errors
 from pctt.ccp.result import Limits, Result, Status
-from pctt.ccp.unbounded import why_unbounded
+from pctt.ccp.unbounded import ROUNDED, why_unbounded
 from pctt.options import number
 
 MANY = 0.9  # of the contacts active: to put these side by side would take as long as all take until the next look
@@ -248,6 +248,7 @@ class Progress:
         self._looks = self._next_look = 0
         self._size, self._last_look = 0.0, (1.0, 0.0)  # of the last step; the residual and the size at the last look
         self._suspicious, self._unbounded = limits.tol, ""
+        self._lowest = 0.0  # curvature of a step, over the greatest
         self._gain = (np.inf, self.iterations)  # residual and iteration of the last progress
         self._met: int | None = None  # the iteration at which the limits were met
 
@@ -285,6 +286,11 @@ class Progress:
         self.status, self.reason = self._why_stop(residual)
         return not self.reason
 
+    def watch(self, curvature: float, square: float, largest: float) -> None:
+        """Note d'Ad and |d|^2 of a step d, and an estimate of the largest eigenvalue of A, which is one at least."""
+        if square > 0:
+            self._lowest = min(self._lowest, curvature / (square * max(largest, 1.0)))
+
     @property
     def impulse(self) -> Array:
         """Of the best point (nc, 3)."""
@@ -296,9 +302,10 @@ class Progress:
         return 0 if self._met is None else self.iterations - self._met
 
     def result(self) -> Result:
-        status = Status.CONVERGED if self.best <= self.limits.tol else self.status
+        indefinite = self._lowest < -ROUNDED
+        status = Status.CONVERGED if self.best <= self.limits.tol and not indefinite else self.status
         given = self.impulse, status, self.reason, self.best, self.iterations
-        return Result(*given, beyond=self.beyond, history=self.history)
+        return Result(*given, beyond=self.beyond, history=self.history, exhausted=indefinite)
 
     def _residual(self, x: Array, gradient: Array | None) -> float:
         """The residual that the tolerance is for; nan where x or its gradient is no number."""
@@ -324,6 +331,9 @@ class Progress:
         """The reason is empty as long as there is none."""
         if self._met is None and residual <= self.limits.tol:
             self._met = self.iterations
+        if self._lowest < -ROUNDED and not self._unbounded:
+            words = f"N is indefinite: d'Nd / d'd is {self._lowest:.1g} of the greatest for a step d"
+            return Status.BREAKDOWN, words
         if residual <= self.limits.aimed or (self._met is not None and self.beyond >= self.limits.spare):
             return Status.CONVERGED, self.limits.met
         if self._unbounded:

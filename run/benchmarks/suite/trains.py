@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 
-from kernels import nineteen, solve
+from kernels import nineteen
+from solutions import solve
 
 
 class Kernel:
-    """A line of 65,536 points, a square of 256^2 and a cube of 64^3; `TensorTrain` by its defaults, as a train of rank
+    """A line of 4,096 points, a square of 64^2 and a cube of 16^3; `TensorTrain` by its defaults, as a train of rank
     100 at most, and no preconditioner."""
 
     params = (["imq1", "exp02", "yukawa50"], ["auto", "train", "plain"])
@@ -16,10 +17,10 @@ class Kernel:
     number, warmup_time, timeout, timer = 1, 0.0, 600, time.process_time
 
     def setup(self, matrix: str, preconditioner: str) -> None:
-        self.problem = nineteen()[matrix]()
+        self.system = nineteen()[matrix]()
 
     def time_solve(self, matrix: str, preconditioner: str) -> None:
-        solve(preconditioner, self.problem)
+        solve(self.system, preconditioner)
 
     def track_iterations(self, matrix: str, preconditioner: str) -> int:
-        return solve(preconditioner, self.problem)["iterations"]
+        return solve(self.system, preconditioner)["iterations"]
