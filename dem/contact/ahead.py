@@ -51,16 +51,20 @@ DEEP = 0.005
 RANK = np.array([0, 3, 9, 1, 5, 6, 4, 2])
 
 
-class Placed(NamedTuple):
-    """The shapes of `dem.contact.primitives.Primitives`, as loops take them."""
+class Forms(NamedTuple):
+    """What `dem.contact.primitives.Primitives` are, as loops take it."""
 
     kind: Ints  #: (n,)
     row: Ints  #: (n,) of the body
-    center: Floats  #: (n, 3) [m]
-    quaternion: Floats  #: (n, 4)
     size: Floats  #: (n, 3) [m]
     radius: Floats  #: (n,) [m]
-    inner: Floats  #: that of `dem.contact.polyhedra.Hulls`
+
+
+class Poses(NamedTuple):
+    """Where they are."""
+
+    center: Floats  #: (n, 3) [m]
+    quaternion: Floats  #: (n, 4)
 
 
 class Course(NamedTuple):
@@ -87,17 +91,18 @@ def guest_is_second(one, two):
 
 
 @loop
-def seen_from(shapes: Placed, course: Course, i: Ints, j: Ints) -> tuple[Floats, Floats, Floats]:
+def seen_from(
+    forms: Forms, poses: Poses, inner: Floats, course: Course, i: Ints, j: Ints
+) -> tuple[Floats, Floats, Floats]:
     """Centres (m, 3) and quaternions (m, 4) of guests, the rows i (m,) of the shapes, at the end of a step, as seen
     from the bodies of their hosts, the rows j (m,), put back to where these are now; and how far the surfaces of the
-    two go along each other until then (m,), at most."""
-    place, velocity, _, dt = course
-    row, center, quaternion = shapes.row, shapes.center, shapes.quaternion
+    two go along each other until then (m,), at most. `inner` is that of `dem.contact.polyhedra.Hulls`."""
+    (place, velocity, _, _), (center, quaternion), row = course, poses, forms.row
     middle, turn, way = np.empty((len(i), 3)), np.empty((len(i), 4)), np.empty(len(i))
     for p in range(len(i)):
         a, b = i[p], j[p]
         A, B = row[a], row[b]
-        h, speed = ahead_by(a, b, shapes, course)
+        h, speed = ahead_by(a, b, forms, poses, inner, course)
         u, w, way[p] = vector_of(velocity[A], 3), vector_of(velocity[B], 3), h * speed
         far = plus(vector_of(place[A], 0), h, vector_of(velocity[A], 0))
         far = plus(far, 1.0, after_turn(plus(center[a], -1.0, place[A]), u, h))
@@ -112,7 +117,7 @@ def seen_from(shapes: Placed, course: Course, i: Ints, j: Ints) -> tuple[Floats,
 
 @loop
 def turn_ahead(
-    shapes: Placed, course: Course, i: Ints, j: Ints, pair: Ints, touch: Touch, arcs: Floats
+    forms: Forms, poses: Poses, inner: Floats, course: Course, i: Ints, j: Ints, pair: Ints, touch: Touch, arcs: Floats
 ) -> tuple[Floats, Floats, Floats, Ints]:
     """Give contacts (nc,) of the pairs of rows i, j (m,) of the shapes the normals of the end of a step and the places
     of its start, of bodies of prescribed motion those of its end: `point` is as seen from the present place of body i.
@@ -122,9 +127,8 @@ def turn_ahead(
     places of `seen_from` get these as their `gap`; returns also which of them overlap by more than DEEP so.
 
     `arcs` (nc, 4, 3) are as of `dem.contact.convex.arcs_of`; empty without such shapes."""
-    kind, row, center, quaternion, size, _, inner = shapes
-    place, velocity, moves, dt = course
-    point, normal, gap = touch
+    (kind, row, size, _), (center, quaternion) = forms, poses
+    (place, velocity, moves, dt), (point, normal, gap) = course, touch
     moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
     deep, found = np.empty(len(pair), np.int64), 0
     for c in range(len(pair)):
@@ -134,7 +138,7 @@ def turn_ahead(
         A, B, sign = row[a], row[b], -1.0 if swap else 1.0
         V, u = vector_of(velocity[A], 0), vector_of(velocity[A], 3)
         W, w = vector_of(velocity[B], 0), vector_of(velocity[B], 3)
-        h, _ = ahead_by(a, b, shapes, course)
+        h, _ = ahead_by(a, b, forms, poses, inner, course)
         here = kind[a] == SPHERE and kind[b] in (SPHERE, PLANE, BOX)
         core = size[a, 0] if kind[a] in (SPHERE, CAPSULE) else 0.0  # its surface turns with the normal, not with a body
         under = size[b, 0] if kind[b] in (SPHERE, CAPSULE) else 0.0
@@ -221,10 +225,10 @@ def _from_host(end, kind, quaternion, size, radius, spin, time):
 
 
 @inlined
-def ahead_by(a, b, shapes, course):
+def ahead_by(a, b, forms, poses, inner, course):
     """The time by which a pair of a guest a and a host b is foreseen: dt, or less where the surface of the one goes
     further along the other than FURTHEST allows; and the speed at which it goes."""
-    kind, row, center, quaternion, size, radius, inner = shapes
+    (kind, row, size, radius), (center, quaternion) = forms, poses
     place, velocity, _, dt = course
     least, other = _thickness(kind[a], size[a], inner), _thickness(kind[b], size[b], inner)
     if other < np.inf and kind[a] in (SPHERE, CAPSULE) and kind[b] not in (SPHERE, CAPSULE):

@@ -10,7 +10,6 @@ from dem import bodies, quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, MESH, PLANE
 from dem.compiled import loop
-from dem.contact.ahead import Placed
 from dem.contact.lists import Lists, Rows
 from dem.contact.primitives import Primitives
 from dem.model.neighbourhood import Neighbourhood
@@ -97,11 +96,12 @@ def _of_grains(
     turning, way = shifts[:, :, 3:].any(axis=(0, 2)), length(shifts[:, :, :3]).max(axis=0)
     grains, parts = Grains(rows.start, rows.other, near.margin, grown), Parts(part, table.row[part] - first, turn)
     least = np.maximum(0.5 * delta, np.where(turning, 0.0, way))
-    given = grains, parts, Ways(near.bodies.position[first:], shifts, turning, least), table.placed(), table.number
+    given = grains, parts, Ways(near.bodies.position[first:], shifts, turning, least)
+    shapes = table.kind, table.center, table.size, table.radius
     done, found, room = 0, 0, len(rows.other) + near.grains + len(part)
     out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
     while True:
-        done, found = fill(*given, done, found, out)
+        done, found = fill(*given, shapes, table.number, done, found, out)
         if done == near.grains:
             i, j, reach = out
             return i[:found], j[:found], reach[:found]
@@ -111,14 +111,15 @@ def _of_grains(
 
 @loop
 def fill(
-    grains: Grains, parts: Parts, ways: Ways, shapes: Placed, number: Ints, done: int, found: int, out: Pairs
-) -> tuple[int, int]:
+    grains: Grains, parts: Parts, ways: Ways, shapes: tuple[Ints, Floats, Floats, Floats], number: Ints, done: int,
+    found: int, out: Pairs,
+) -> tuple[int, int]:  # fmt: skip
     """Add to the first pairs of `out` those of the grains that are not done, as long as there is room; new numbers of
     grains done and pairs found."""
     start, other, margin, grown = grains
     part, body, turn = parts
     pivot, shifts, turning, least = ways
-    kind, center, size, radius = shapes.kind, shapes.center, shapes.size, shapes.radius
+    kind, center, size, radius = shapes
     i, j, reach = out
     for n in range(done, len(start) - 1):
         if found + start[n + 1] - start[n] + len(part) > len(i):

@@ -21,7 +21,7 @@ import numpy as np
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, half_thickness
 from dem.compiled import inlined, loop
-from dem.contact.ahead import Course, Placed, after_turn, ahead_by, guest_is_second, spun, vector_of
+from dem.contact.ahead import Course, Forms, Poses, after_turn, ahead_by, guest_is_second, spun, vector_of
 from dem.contact.narrow import DISTINCT, Manifold, Planes, Touch
 from dem.contact.polyhedra import CLOSE, ROUND, SNAP, Found, Hulls, nearer
 from dem.contact.spheres import frame_of
@@ -526,15 +526,15 @@ def _planes(body, hulls, outward, origin, delta, contacts):
 
 @loop
 def arcs_of(
-    shapes: Placed, course: Course, i: Ints, j: Ints, pair: Ints, touch: Touch, supports: Supports
-) -> Floats:
+    forms: Forms, poses: Poses, inner: Floats, course: Course, i: Ints, j: Ints, pair: Ints, touch: Touch,
+    supports: Supports,
+) -> Floats:  # fmt: skip
     """Of contacts (nc,) as of `dem.contact.ahead.turn_ahead`, vectors (nc, 4, 3) from what turns with the bodies to
     their surfaces where these have the foreseen normal [m]: of guests at the end of the step and at its start, of hosts
     at these two. As a surface rolls on, the contact stays where its normal is. Zeros of points that go with the body,
     and of shapes of other kinds."""
-    kind, row, center, quaternion, size, _, _ = shapes
-    place, velocity, _, _ = course
-    point, normal, gap = touch
+    (kind, row, size, _), (center, quaternion) = forms, poses
+    (place, velocity, _, _), (point, normal, gap) = course, touch
     what, numbers, radii, _ = supports
     arcs = np.zeros((len(pair), 4, 3))
     for c in range(len(pair)):
@@ -545,7 +545,7 @@ def arcs_of(
             continue
         A, B, sign = row[a], row[b], -1.0 if swap else 1.0
         u, w = vector_of(velocity[A], 3), vector_of(velocity[B], 3)
-        h, _ = ahead_by(a, b, shapes, course)
+        h, _ = ahead_by(a, b, forms, poses, inner, course)
         n = after_turn((sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]), w, h)
         middle = after_turn(plus(point[c], -1.0, place[B]), w, h)
         apart = plus(place[A], -1.0, place[B])

@@ -69,6 +69,10 @@ class Hulls(NamedTuple):
         """Of a pair: a corner of the first, a corner of the second, two edges."""
         return 2 * self.vertex.shape[1] + self.edge.shape[1] ** 2
 
+    def tables(self) -> tuple[tuple[Floats, Ints, Floats, Floats], tuple[Ints, Ints, Ints, Ints], Floats]:
+        """Vertices and faces, what they share, and insets, as loops take them."""
+        return self[2:6], self[6:10], self.inset
+
 
 @cache
 def hulls_of(forms: tuple[Form, ...]) -> Hulls:
@@ -107,10 +111,10 @@ class Polyhedra(NamedTuple):
     hull: Ints  #: (m,) rows of `hulls`
     hulls: Hulls
 
-    def contiguous(self) -> Polyhedra:
-        """The same, as loops take them."""
+    def columns(self) -> tuple[Floats, Floats, Floats, Ints]:
+        """Without the table of hulls, as loops take them."""
         center, turn, scale = (np.ascontiguousarray(column) for column in (self.center, self.turn, self.scale))
-        return self._replace(center=center, turn=turn, scale=scale)
+        return center, turn, scale, self.hull
 
 
 class Found(NamedTuple):
@@ -143,9 +147,9 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
     """
     most = 4 * first.hulls.corner.shape[2] + 2 * first.hulls.vertex.shape[1]
     done, found, room = 0, 0, 4 * len(delta) + most
-    first, second, contacts = first.contiguous(), second.contiguous(), Found.of(room)
+    given, contacts = (*first.hulls.tables(), first.columns(), second.columns(), delta), Found.of(room)
     while True:
-        done, found = _pairs(first, second, delta, most, done, found, contacts)
+        done, found = _pairs(*given, most, (done, found), contacts)
         if done == len(delta):
             return contacts.manifold(found)
         contacts = contacts.doubled()
@@ -154,13 +158,13 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
 def spheres_polyhedra(ball: Spheres, body: Polyhedra, delta: Floats) -> Manifold:
     """One contact, at the closest point; a centre inside is pushed out through the nearest face."""
     contacts = Found.of(len(delta))
-    return contacts.manifold(_spheres(ball, body.contiguous(), delta, contacts))
+    return contacts.manifold(_spheres(ball, body.hulls.tables()[0], body.hulls.corner, body.columns(), delta, contacts))
 
 
 def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
     """The corners."""
     contacts = Found.of(len(delta) * body.hulls.vertex.shape[1])
-    return contacts.manifold(_planes(body.contiguous(), plane, delta, contacts))
+    return contacts.manifold(_planes(body.hulls.tables()[0], body.columns(), plane, delta, contacts))
 
 
 @loop
@@ -169,10 +173,9 @@ def _set(out, k, x, y, z, u, v, w, gap):
 
 
 @loop
-def _planes(body, plane, delta, contacts):
+def _planes(faces, body, plane, delta, contacts):
     """Fill in the contacts of polyhedra with half spaces; their number."""
-    center, turn, scale, hull, hulls = body
-    count, vertex = hulls.counts, hulls.vertex
+    (_, count, vertex, _), (center, turn, scale, hull) = faces, body
     (outward, origin), (pair, feature, out) = plane, contacts
     found = 0
     for m in range(len(hull)):
@@ -668,13 +671,12 @@ def _frame(normal, sign, one, other, frame):
 
 
 @loop
-def _pairs(first, second, delta, most, done, found, contacts):
+def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
     """Add to the first contacts those of the pairs that are not done, as long as there is room for the `most` that a
     pair has; new numbers of pairs done and contacts found."""
-    center, turn, scale, hull, hulls = first
-    other_center, other_turn, other_scale, other_hull, _ = second
-    _, _, sharp, count, vertex, normal, corner, side, edge, wing, inset = hulls
-    pair, feature, out = contacts
+    (sharp, count, vertex, normal), (corner, side, edge, wing) = faces, sides
+    (center, turn, scale, hull), (other_center, other_turn, other_scale, other_hull) = first, second
+    (done, found), (pair, feature, out) = progress, contacts
     v, f, s, e = vertex.shape[1], normal.shape[1], corner.shape[2], edge.shape[1]
     points, normals, level = np.empty((2, v, 3)), np.empty((2, f, 3)), np.empty((2, f))
     slopes, axis, frame, place = np.empty((2, e, f)), np.empty(3), np.empty((3, 3)), np.empty((2, 3))
@@ -876,10 +878,9 @@ def _between(a, b, c, d, place):
 
 
 @loop
-def _spheres(spheres, body, delta, contacts):
+def _spheres(spheres, faces, corner, body, delta, contacts):
     """Fill in the contacts of spheres with polyhedra; their number."""
-    (ball, radius), (center, turn, scale, hull, hulls) = spheres, body
-    count, vertex, normal, corner = hulls.counts, hulls.vertex, hulls.normal, hulls.corner
+    (ball, radius), (_, count, vertex, normal), (center, turn, scale, hull) = spheres, faces, body
     pair, feature, out = contacts
     points, normals, level = np.empty(vertex.shape[1:]), np.empty(normal.shape[1:]), np.empty(normal.shape[1])
     way, ends, share, parts = np.empty((4, 3)), np.empty((4, 2), np.int64), np.empty(4), np.empty(6)

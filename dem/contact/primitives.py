@@ -11,7 +11,7 @@ import numpy as np
 from dem import quaternion
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
-from dem.contact.ahead import Course, Placed, hosts_first, seen_from, turn_ahead
+from dem.contact.ahead import Course, Forms, Poses, hosts_first, seen_from, turn_ahead
 from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.convex import Solids, Supports, arcs_of, solids, solids_planes, solids_solids, supports_of
 from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
@@ -69,10 +69,10 @@ class Primitives(NamedTuple):
         columns = {name: getattr(self, name)[rows] for name in names}
         return self._replace(**columns, surfaces={}, members=None)
 
-    def placed(self) -> Placed:
-        """What loops take of it."""
-        columns = self.kind, self.row, self.center, self.quaternion, self.size, self.radius
-        return Placed(*columns, self.hulls.inner)
+    def tables(self) -> tuple[Forms, Poses, Floats]:
+        """What the loops of `dem.contact.ahead` take of it."""
+        forms, poses = Forms(self.kind, self.row, self.size, self.radius), Poses(self.center, self.quaternion)
+        return forms, poses, self.hulls.inner
 
     def now(self, near: Neighbourhood) -> Primitives:
         """The same where the bodies are; parts come from the frames of their bodies."""
@@ -224,7 +224,7 @@ def touches_ahead(
     """The contacts as `turn_ahead` gives them directions of the end of a step, and what this returns of them. A deep
     gap is no deeper than the pair overlaps at the start, and none is wider than `delta` there."""
     found = touches(table, i, j, delta, course)
-    given, arcs = (table.placed(), course, i, j, found.pair, found.touch), np.zeros((0, 4, 3))
+    given, arcs = (*table.tables(), course, i, j, found.pair, found.touch), np.zeros((0, 4, 3))
     if (table.kind >= CONVEX).any():
         arcs = arcs_of(*given, table.supports)
     moved, swing, linear, deep = turn_ahead(*given, arcs)
@@ -246,7 +246,7 @@ def _touching(
     contacts, first, second = _TOUCH[kinds]
     guests = table.take(i)
     if course is not None:
-        center, turn, way = seen_from(table.placed(), course, i, j)
+        center, turn, way = seen_from(*table.tables(), course, i, j)
         guests, delta = guests._replace(center=center, quaternion=turn), delta + way
     if second is not None:
         further = (table.hulls,) if first is Primitives.solid or second is Primitives.solid else ()

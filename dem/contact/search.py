@@ -121,7 +121,7 @@ def find_contacts(
     table, i, j, reach = table.of_members(*pairs)
     found, ahead = _narrow(world, near, images, table, (i, j, reach), free)
     key, a, b, body, friction, owned = named(
-        *(table.placed(), table.number, near.index, near.bodies.material, world.pairs.friction),
+        *((table.kind, table.row), table.number, near.index, near.bodies.material, world.pairs.friction),
         *(table.hulls.features, near.grains, (i, j), (found.pair, found.feature)),
     )
     contacts = Contacts(key, a, b, body, *found.touch, friction, near, shifts, owned, lists, **ahead)
@@ -237,8 +237,7 @@ def named(shapes, number, index, material, friction, features, grains, pairs, co
 
     Keys are distinct, and the same at all times: the number of the one, and that of the other with the feature. A mesh
     takes further numbers for its features."""
-    kind, row = shapes.kind, shapes.row
-    (i, j), (pair, feature) = pairs, contacts
+    (kind, row), (i, j), (pair, feature) = shapes, pairs, contacts
     key, a, b = np.empty(len(pair), np.complex128), np.empty(len(pair), np.int64), np.empty(len(pair), np.int64)
     body, mu, owned = np.empty((len(pair), 2), np.int64), np.empty(len(pair)), np.zeros(grains)
     for c in range(len(pair)):

@@ -52,7 +52,6 @@ class Touching(NamedTuple):
     two: Ints  #: (nc,) of the second ones
     normal: Floats  #: (nc, 3)
     gap: Floats  #: (nc,) [m]
-    linear: Floats  #: (nc,) [m]
 
 
 class Spheres(NamedTuple):
@@ -62,8 +61,6 @@ class Spheres(NamedTuple):
     mass: Floats  #: (rows,) [kg]
     radius: Floats  #: (rows,) [m]
     material: Ints  #: (rows,)
-    place: Floats  #: (rows, 3) [m]
-    velocity: Floats  #: (rows, 6) before the step, of prescribed motions that of the step
 
 
 def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> Contacts:
@@ -86,10 +83,10 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         old[grains:] = motion.prescribed
     image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     slow, radius = dt * math.hypot(*world.gravity), np.ascontiguousarray(table.size[:, 0])
-    touching = Touching(contacts.a, contacts.b, contacts.normal, contacts.gap, contacts.linear_gap)
-    spheres = Spheres(ball, table.mass, radius, table.material, table.position, old)
     kind, bounce, offset, marked = struck(
-        touching, spheres, pairs.restitution, pairs.stiffness, grains, image, dt, slow
+        Touching(contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
+        Spheres(ball, table.mass, radius, table.material), (table.position, old),
+        (pairs.restitution, pairs.stiffness), grains, image, dt, slow,
     )  # fmt: skip
     if not on_any(world.comm, bool(marked.any()))[0]:
         return contacts
@@ -169,15 +166,15 @@ def _reached(world: World, contacts: Contacts, pairs: Ints, marked: Bools) -> Bo
 
 @loop
 def struck(
-    contacts: Touching, spheres: Spheres, restitution: Floats, stiffness: Floats, grains: int, image: Floats, dt: float,
-    slow: float,
+    contacts: Touching, linear: Floats, spheres: Spheres, motions: tuple[Floats, Floats], laws: tuple[Floats, Floats],
+    grains: int, image: Floats, dt: float, slow: float,
 ) -> tuple[Ints, Floats, Floats, Bools]:  # fmt: skip
     """Of contacts (nc,) the kinds (nc,), the coefficients of restitution (nc,)
     and the ways from the second bodies to their images (nc, 3), of spheres `image`; and which bodies (rows,) meet by
     the velocities before the step, or pass each other while the linear gap closes. Those that press others that they
     touch are left out."""
-    one, two, normal, gap, linear = contacts
-    ball, mass, radius, material, place, velocity = spheres
+    (one, two, normal, gap), (ball, mass, radius, material) = contacts, spheres
+    (place, velocity), (restitution, stiffness) = motions, laws
     count = len(one)
     kind, bounce, offset = np.full(count, OTHER), np.empty(count), np.zeros((count, 3))
     meets, passes, marked = np.zeros(count, np.bool_), np.zeros(count, np.bool_), np.zeros(len(place), np.bool_)

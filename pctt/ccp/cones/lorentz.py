@@ -136,8 +136,8 @@ class ArrowInverse(NamedTuple):
         drown in rounding: late in an iteration it has eigenvalues that differ by 1e18."""
         lorentz, parts_of = self.lorentz, self.lorentz.width // 3
         out = np.zeros((lorentz.count, lorentz.width))
-        parts = self.right, self.left, self.D, self.part, self.sigma
-        _alone(f, joined(r, parts_of), lorentz.weight.ravel(), lorentz.place, self.tangential, parts, out)
+        parts, weights = (self.right, self.left, self.D, self.part), (lorentz.weight.ravel(), self.sigma)
+        _alone(f, joined(r, parts_of), weights, lorentz.place, self.tangential, parts, out)
         return rows(out, parts_of)
 
 
@@ -221,8 +221,8 @@ def _arrows(root, size, u, weight, live, place, normal, tangential, X):
 
 
 @loop
-def _alone(f, r, weight, place, tangential, parts, out):
-    right, left, D, part, sigma = parts
+def _alone(f, r, weights, place, tangential, parts, out):
+    (right, left, D, part), (weight, sigma) = parts, weights
     count, total = len(out), len(f)
     for c in range(count):
         normal = -r[c, 0]

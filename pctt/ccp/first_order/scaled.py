@@ -67,7 +67,7 @@ class ScaledProblem:
         self._impulse, self._velocity = self._units
         self.b, self._compliance = np.empty((2, *shape), precision)
         given = problem.diagonal, problem.mean_diagonal, self.unit, problem.r, problem.compliance
-        _scale(*given, (self.shrink, self._impulse, self._velocity, self.b, self._compliance))
+        _scale(*given, (self.shrink, self._impulse, self._velocity), self.b, self._compliance)
         self.cones = problem.cones.scaled(self._velocity, precision)
         self._operator = problem.operator.scaled(self.shrink, precision)
         soft = self._compliance[: None if problem.yields else 0]
@@ -201,9 +201,9 @@ class ScaledProblem:
 
 
 @loop
-def _scale(diagonal, mean, unit, r, compliance, out):
+def _scale(diagonal, mean, unit, r, compliance, units, b, soft):
     """Fill in five arrays (nc, 3) of a `ScaledProblem`, for the diagonal of N, its mean, and the unit."""
-    shrink, impulse, velocity, b, soft = out
+    shrink, impulse, velocity = units
     for c in range(len(r)):
         normal, tangential = diagonal[c, 0], 0.5 * (diagonal[c, 1] + diagonal[c, 2])
         normal = np.sqrt(normal if normal > 0.0 else mean)
