@@ -27,7 +27,7 @@ there then goes with the host (`seen_from`, `turn_ahead`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,9 +36,6 @@ from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPH
 from dem.compiled import inlined, loop
 from dem.contact.spheres import frame_of, to_box
 from dem.geometry.vectors import cross, dot, plus, shares, turned
-
-if TYPE_CHECKING:
-    from dem.contact.narrow import Touch
 
 #: Radii (half thicknesses) by which a body is moved ahead along another one, at most: its impulses may stop it sooner.
 FURTHEST = 0.25
@@ -51,20 +48,8 @@ DEEP = 0.005
 RANK = np.array([0, 3, 9, 1, 5, 6, 4, 2])
 
 
-class Forms(NamedTuple):
-    """What `dem.contact.primitives.Primitives` are, as loops take it."""
-
-    kind: Ints  #: (n,)
-    row: Ints  #: (n,) of the body
-    size: Floats  #: (n, 3) [m]
-    radius: Floats  #: (n,) [m]
-
-
-class Poses(NamedTuple):
-    """Where they are."""
-
-    center: Floats  #: (n, 3) [m]
-    quaternion: Floats  #: (n, 4)
+Forms = tuple[Ints, Ints, Floats, Floats]  #: kind, row, size, radius of `dem.contact.primitives.Primitives`
+Poses = tuple[Floats, Floats]  #: their centres and quaternions
 
 
 class Course(NamedTuple):
@@ -74,6 +59,9 @@ class Course(NamedTuple):
     velocity: Floats  #: (rows, 6) [m/s, rad/s]
     moves: Bools  #: (rows,) which of them impulses move
     dt: float  #: [s]
+
+Moving = tuple[Floats, Floats, Bools, float]  #: a `Course`
+Touching = tuple[Floats, Floats, Floats]  #: a `Touch`
 
 
 def hosts_first(one: Ints, two: Ints) -> Bools:
@@ -92,12 +80,12 @@ def guest_is_second(one, two):
 
 @loop
 def seen_from(
-    forms: Forms, poses: Poses, inner: Floats, course: Course, i: Ints, j: Ints
+    forms: Forms, poses: Poses, inner: Floats, course: Moving, i: Ints, j: Ints
 ) -> tuple[Floats, Floats, Floats]:
     """Centres (m, 3) and quaternions (m, 4) of guests, the rows i (m,) of the shapes, at the end of a step, as seen
     from the bodies of their hosts, the rows j (m,), put back to where these are now; and how far the surfaces of the
     two go along each other until then (m,), at most. `inner` is that of `dem.contact.polyhedra.Hulls`."""
-    (place, velocity, _, _), (center, quaternion), row = course, poses, forms.row
+    (place, velocity, _, _), (center, quaternion), row = course, poses, forms[1]
     middle, turn, way = np.empty((len(i), 3)), np.empty((len(i), 4)), np.empty(len(i))
     for p in range(len(i)):
         a, b = i[p], j[p]
@@ -117,8 +105,9 @@ def seen_from(
 
 @loop
 def turn_ahead(
-    forms: Forms, poses: Poses, inner: Floats, course: Course, i: Ints, j: Ints, pair: Ints, touch: Touch, arcs: Floats
-) -> tuple[Floats, Floats, Floats, Ints]:
+    forms: Forms, poses: Poses, inner: Floats, course: Moving, i: Ints, j: Ints, pair: Ints, touch: Touching,
+    arcs: Floats,
+) -> tuple[Floats, Floats, Floats, Ints]:  # fmt: skip
     """Give contacts (nc,) of the pairs of rows i, j (m,) of the shapes the normals of the end of a step and the places
     of its start, of bodies of prescribed motion those of its end: `point` is as seen from the present place of body i.
     Returns (nc, 3) from body j to where it is relative to i for that [m]; by how much (nc, 3) the mean

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from dem import bodies, quaternion
@@ -20,30 +18,15 @@ from dem.quaternion import cross, length
 Pairs = tuple[Ints, Ints, Floats]
 
 
-class Grains(NamedTuple):
-    """Grains and the pairs of a `Rows`."""
+#: The `Rows` of grains: start and other; their margins (grains + ghosts,) [m], and which of them have pairs that count.
+Grains = tuple[Ints, Ints, Floats, Bools]
 
-    start: Ints  #: (grains + 1,)
-    other: Ints  #: (start[-1],)
-    margin: Floats  #: (grains + ghosts,) [m]
-    grown: Bools  #: (grains + ghosts,) which of them have pairs that count
+#: Of parts of large bodies the rows (p,) of `Primitives`, the bodies (p,) and the frames (p, 9).
+Parts = tuple[Ints, Ints, Floats]
 
-
-class Parts(NamedTuple):
-    """Parts of large bodies."""
-
-    row: Ints  #: (p,) of `Primitives`
-    body: Ints  #: (p,)
-    turn: Floats  #: (p, 9) frames
-
-
-class Ways(NamedTuple):
-    """How large bodies go on."""
-
-    pivot: Floats  #: (bodies, 3) [m]
-    shifts: Floats  #: (k, bodies, 6) by which they may move and turn [m, rad]
-    turning: Bools  #: (bodies,) which of them have surfaces that go further than their
-    least: Floats  #: (bodies,) margins [m]
+#: Of large bodies the pivots (bodies, 3), the shifts (k, bodies, 6) by which they may move and turn, which of them
+#: (bodies,) have surfaces that go further than their margins, and these (bodies,).
+Ways = tuple[Floats, Floats, Bools, Floats]
 
 
 def meeting(
@@ -94,9 +77,9 @@ def _of_grains(
     part = first + wanted.nonzero()[0]
     turn = quaternion.matrix(table.quaternion[part]).reshape(-1, 9)
     turning, way = shifts[:, :, 3:].any(axis=(0, 2)), length(shifts[:, :, :3]).max(axis=0)
-    grains, parts = Grains(rows.start, rows.other, near.margin, grown), Parts(part, table.row[part] - first, turn)
+    grains, parts = (rows.start, rows.other, near.margin, grown), (part, table.row[part] - first, turn)
     least = np.maximum(0.5 * delta, np.where(turning, 0.0, way))
-    given = grains, parts, Ways(near.bodies.position[first:], shifts, turning, least)
+    given = grains, parts, (near.bodies.position[first:], shifts, turning, least)
     shapes = table.kind, table.center, table.size, table.radius
     done, found, room = 0, 0, len(rows.other) + near.grains + len(part)
     out = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)

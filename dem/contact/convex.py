@@ -21,8 +21,8 @@ import numpy as np
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, half_thickness
 from dem.compiled import inlined, loop
-from dem.contact.ahead import Course, Forms, Poses, after_turn, ahead_by, guest_is_second, spun, vector_of
-from dem.contact.narrow import DISTINCT, Manifold, Planes, Touch
+from dem.contact.ahead import Forms, Moving, Poses, Touching, after_turn, ahead_by, guest_is_second, spun, vector_of
+from dem.contact.narrow import DISTINCT, Manifold, Planes
 from dem.contact.polyhedra import CLOSE, ROUND, SNAP, Found, Hulls, nearer
 from dem.contact.spheres import frame_of
 from dem.geometry.vectors import dot, plus
@@ -107,7 +107,7 @@ def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) ->
     done, found, room = 0, 0, 4 * len(delta) + POINTS
     contacts = Found.of(room)
     while True:
-        done, found = _pairs(first, second, hulls, delta, done, found, contacts)
+        done, found = _pairs(first, second, hulls, delta, done, found, tuple(contacts))
         if done == len(delta):
             return contacts.manifold(found)
         contacts = contacts.doubled()
@@ -116,7 +116,7 @@ def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) ->
 def solids_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> Manifold:
     """What of the body lies flush along the plane: the points of a face or a side, and the support."""
     contacts, (outward, origin) = Found.of(len(delta) * POINTS), map(np.ascontiguousarray, plane)
-    return contacts.manifold(_planes(body, hulls, outward, origin, delta, contacts))
+    return contacts.manifold(_planes(body, hulls, outward, origin, delta, tuple(contacts)))
 
 
 def _chain(functions: Sequence[Any]) -> Any:
@@ -526,8 +526,8 @@ def _planes(body, hulls, outward, origin, delta, contacts):
 
 @loop
 def arcs_of(
-    forms: Forms, poses: Poses, inner: Floats, course: Course, i: Ints, j: Ints, pair: Ints, touch: Touch,
-    supports: Supports,
+    forms: Forms, poses: Poses, inner: Floats, course: Moving, i: Ints, j: Ints, pair: Ints, touch: Touching,
+    supports: tuple[Ints, Floats, Floats, Floats],
 ) -> Floats:  # fmt: skip
     """Of contacts (nc,) as of `dem.contact.ahead.turn_ahead`, vectors (nc, 4, 3) from what turns with the bodies to
     their surfaces where these have the foreseen normal [m]: of guests at the end of the step and at its start, of hosts

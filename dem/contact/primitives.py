@@ -71,8 +71,7 @@ class Primitives(NamedTuple):
 
     def tables(self) -> tuple[Forms, Poses, Floats]:
         """What the loops of `dem.contact.ahead` take of it."""
-        forms, poses = Forms(self.kind, self.row, self.size, self.radius), Poses(self.center, self.quaternion)
-        return forms, poses, self.hulls.inner
+        return (self.kind, self.row, self.size, self.radius), (self.center, self.quaternion), self.hulls.inner
 
     def now(self, near: Neighbourhood) -> Primitives:
         """The same where the bodies are; parts come from the frames of their bodies."""
@@ -224,9 +223,10 @@ def touches_ahead(
     """The contacts as `turn_ahead` gives them directions of the end of a step, and what this returns of them. A deep
     gap is no deeper than the pair overlaps at the start, and none is wider than `delta` there."""
     found = touches(table, i, j, delta, course)
-    given, arcs = (*table.tables(), course, i, j, found.pair, found.touch), np.zeros((0, 4, 3))
+    given: Any = *table.tables(), tuple(course), i, j, found.pair, tuple(found.touch)
+    arcs = np.zeros((0, 4, 3))
     if (table.kind >= CONVEX).any():
-        arcs = arcs_of(*given, table.supports)
+        arcs = arcs_of(*given, table.supports[:])
     moved, swing, linear, deep = turn_ahead(*given, arcs)
     if len(deep):
         pairs, row = np.unique(found.pair[deep], return_inverse=True)
@@ -246,7 +246,8 @@ def _touching(
     contacts, first, second = _TOUCH[kinds]
     guests = table.take(i)
     if course is not None:
-        center, turn, way = seen_from(*table.tables(), course, i, j)
+        going: Any = tuple(course)
+        center, turn, way = seen_from(*table.tables(), going, i, j)
         guests, delta = guests._replace(center=center, quaternion=turn), delta + way
     if second is not None:
         further = (table.hulls,) if first is Primitives.solid or second is Primitives.solid else ()

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -45,22 +45,11 @@ ROUNDING = 1e-9
 SHORT = 25.0
 
 
-class Touching(NamedTuple):
-    """Columns of `Contacts`."""
+#: Of contacts (nc,) the rows of the two bodies, the normals (nc, 3) and the gaps.
+Touching = tuple[Ints, Ints, Floats, Floats]
 
-    one: Ints  #: (nc,) rows of the first bodies
-    two: Ints  #: (nc,) of the second ones
-    normal: Floats  #: (nc, 3)
-    gap: Floats  #: (nc,) [m]
-
-
-class Spheres(NamedTuple):
-    """Bodies, of which some are spheres."""
-
-    ball: Bools  #: (rows,) which
-    mass: Floats  #: (rows,) [kg]
-    radius: Floats  #: (rows,) [m]
-    material: Ints  #: (rows,)
+#: Of bodies (rows,) which are spheres, the masses, the radii of spheres, and the materials.
+Spheres = tuple[Bools, Floats, Floats, Ints]
 
 
 def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> Contacts:
@@ -84,8 +73,8 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     slow, radius = dt * math.hypot(*world.gravity), np.ascontiguousarray(table.size[:, 0])
     kind, bounce, offset, marked = struck(
-        Touching(contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
-        Spheres(ball, table.mass, radius, table.material), (table.position, old),
+        (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
+        (ball, table.mass, radius, table.material), (table.position, old),
         (pairs.restitution, pairs.stiffness), grains, image, dt, slow,
     )  # fmt: skip
     if not on_any(world.comm, bool(marked.any()))[0]:
