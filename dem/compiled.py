@@ -2,7 +2,7 @@
 
 numba is imported, and a loop compiled, at its first call: the import takes half a second. The machine code is kept on
 disk. Arrays are C-contiguous; of other types or layouts a loop would be compiled once more.
-Tables that loops take are plain tuples of at most four arrays: of longer ones, and of named ones, numba may find the
+Tables that loops take are plain tuples (`named[:]`) of at most four arrays: of longer and of named ones numba finds the
 type in Python, at every call.
 
 A loop over `prange` whose passes do not depend on each other is compiled twice, for one thread and for several

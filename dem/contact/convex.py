@@ -107,7 +107,7 @@ def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) ->
     done, found, room = 0, 0, 4 * len(delta) + POINTS
     contacts = Found.of(room)
     while True:
-        done, found = _pairs(first, second, hulls, delta, done, found, tuple(contacts))
+        done, found = _pairs(first, second, hulls, delta, done, found, contacts[:])
         if done == len(delta):
             return contacts.manifold(found)
         contacts = contacts.doubled()
@@ -116,7 +116,7 @@ def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) ->
 def solids_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> Manifold:
     """What of the body lies flush along the plane: the points of a face or a side, and the support."""
     contacts, (outward, origin) = Found.of(len(delta) * POINTS), map(np.ascontiguousarray, plane)
-    return contacts.manifold(_planes(body, hulls, outward, origin, delta, tuple(contacts)))
+    return contacts.manifold(_planes(body, hulls, outward, origin, delta, contacts[:]))
 
 
 def _chain(functions: Sequence[Any]) -> Any:

@@ -149,7 +149,7 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
     done, found, room = 0, 0, 4 * len(delta) + most
     given, contacts = (*first.hulls.tables(), first.columns(), second.columns(), delta), Found.of(room)
     while True:
-        done, found = _pairs(*given, most, (done, found), tuple(contacts))
+        done, found = _pairs(*given, most, (done, found), contacts[:])
         if done == len(delta):
             return contacts.manifold(found)
         contacts = contacts.doubled()
@@ -158,14 +158,14 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
 def spheres_polyhedra(ball: Spheres, body: Polyhedra, delta: Floats) -> Manifold:
     """One contact, at the closest point; a centre inside is pushed out through the nearest face."""
     contacts, hulls = Found.of(len(delta)), body.hulls
-    given = tuple(ball), hulls.tables()[0], hulls.corner, body.columns(), delta
-    return contacts.manifold(_spheres(*given, tuple(contacts)))
+    given = ball[:], hulls.tables()[0], hulls.corner, body.columns(), delta
+    return contacts.manifold(_spheres(*given, contacts[:]))
 
 
 def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
     """The corners."""
     contacts = Found.of(len(delta) * body.hulls.vertex.shape[1])
-    return contacts.manifold(_planes(body.hulls.tables()[0], body.columns(), tuple(plane), delta, tuple(contacts)))
+    return contacts.manifold(_planes(body.hulls.tables()[0], body.columns(), plane[:], delta, contacts[:]))
 
 
 @loop

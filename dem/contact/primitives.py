@@ -223,8 +223,7 @@ def touches_ahead(
     """The contacts as `turn_ahead` gives them directions of the end of a step, and what this returns of them. A deep
     gap is no deeper than the pair overlaps at the start, and none is wider than `delta` there."""
     found = touches(table, i, j, delta, course)
-    given: Any = *table.tables(), tuple(course), i, j, found.pair, tuple(found.touch)
-    arcs = np.zeros((0, 4, 3))
+    given, arcs = (*table.tables(), course[:], i, j, found.pair, found.touch[:]), np.zeros((0, 4, 3))
     if (table.kind >= CONVEX).any():
         arcs = arcs_of(*given, table.supports[:])
     moved, swing, linear, deep = turn_ahead(*given, arcs)
@@ -246,8 +245,7 @@ def _touching(
     contacts, first, second = _TOUCH[kinds]
     guests = table.take(i)
     if course is not None:
-        going: Any = tuple(course)
-        center, turn, way = seen_from(*table.tables(), going, i, j)
+        center, turn, way = seen_from(*table.tables(), course[:], i, j)
         guests, delta = guests._replace(center=center, quaternion=turn), delta + way
     if second is not None:
         further = (table.hulls,) if first is Primitives.solid or second is Primitives.solid else ()
