@@ -16,20 +16,20 @@ def overlaps(step: Step, large: Floats) -> tuple[float, float]:
     the forces of the step, as parts of half thicknesses; of two large bodies those of the thinner, with the half
     thicknesses `large` (large bodies,) [m]; collective."""
     contacts, system, near = step.contacts, step.system, step.contacts.near
-    springs, pairs = (system.stiffness, system.compliance[:, 0]), (contacts.a, contacts.b)
-    given = contacts.gap, contacts.linear_gap, step.in_cone, springs, system.dt
+    laws, pairs = (system.stiffness, system.compliance[:, 0]), (contacts.a, contacts.b)
+    given = contacts.gap, contacts.linear_gap, step.in_cone, laws, system.dt
     found = deepest(*given, pairs, (near.bodies.shape, near.bodies.size), large, near.grains + near.ghosts)
     return tuple(reduced(step.world.comm, (), found)[1])  # type: ignore[return-value]
 
 
 @loop
 def deepest(
-    gap: Floats, linear: Floats, impulse: Floats, springs: tuple[Floats, Floats], dt: float, pairs: tuple[Ints, Ints],
+    gap: Floats, linear: Floats, impulse: Floats, laws: tuple[Floats, Floats], dt: float, pairs: tuple[Ints, Ints],
     grains: tuple[Ints, Floats], large: Floats, first: int,
 ) -> tuple[float, float]:  # fmt: skip
     """`overlaps` of contacts (nc,) of the bodies in the rows a, b, of which those from `first` on are large ones with
     the half thicknesses `large`."""
-    (stiffness, compliance), (a, b), (shape, size) = springs, pairs, grains
+    (stiffness, compliance), (a, b), (shape, size) = laws, pairs, grains
     start, held = 0.0, 0.0
     for c in range(len(gap)):
         # of an overlap d the part d c dt / (k dt^2 + c dt) is left, and of the impulse g dt C g (`dem.start.stiffness`)
