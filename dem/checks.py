@@ -14,7 +14,7 @@ from dem.arrays import ArrayLike, Floats
 def nearest(name: str, known: Iterable[str], dash: str = "", alike: float = 0.6) -> str:
     """The end of a message: the known name that the user may have meant, if the two are ``alike`` (of `difflib`), or
     that is the beginning of the name."""
-    begins = [each for each in known if len(each) > 2 and name.startswith(each)]
+    begins = sorted((each for each in known if len(each) > 2 and name.startswith(each)), key=len, reverse=True)
     close = begins or difflib.get_close_matches(name, sorted(known), n=1, cutoff=alike)
     return f"; did you mean {dash}{close[0]}?" if close else ""
 

@@ -106,7 +106,7 @@ def test_both_sizes_fall_in_the_shaken_box():
     np.testing.assert_allclose(records["segregation"], (large - small) / (large + small))
 
 
-@pytest.mark.parametrize("shape", ["stones", "dodecahedra"])
+@pytest.mark.parametrize("shape", ["dodecahedra", pytest.param("stones", marks=pytest.mark.slow)])
 def test_the_sleeper_comes_down_on_the_ballast(shape):
     _, records = run("ballast", 120, scene_n="2", scene_settling_time="0", scene_shape=shape)
     assert records["force_sleeper_z [N]"].max() > 500
@@ -125,6 +125,7 @@ def test_the_belt_carries_the_capsules():
     assert records["power [W]"].sum() > 0
 
 
+@pytest.mark.slow
 def test_the_feeder_carries_to_its_end_what_its_source_feeds():
     scene, records = run("feeder", 400, scene_rate="8", scene_speed="8", dt="0.004", scene_radius="0.03")
     came, left = records["mass_feed [kg]"], records["mass_end [kg]"]

@@ -78,6 +78,7 @@ def test_the_loads_of_their_page_give_what_it_says(in_folder, capsys):
     assert said == pytest.approx([0.3 * 9.81 - 1.0, -pull, pull, 0.2], rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_hopper_of_the_page_of_sources_fills_and_runs_out(in_folder, capsys):
     (text,) = blocks("docs/sources.md")
     exec(text, {})

@@ -81,7 +81,8 @@ class Dump:
         if problem.size > self.most:
             self._hard_left = 0
             words = f"step {number} is not solved, and its {problem.size} contacts are more than are written unasked"
-            warn(self._world.comm, f"{words}; allowed are {self.most}, or problems to a folder (docs/files.md)")
+            keep = "unless the run keeps all problems (-dump_problem FOLDER, in Python problems=FOLDER)"
+            warn(self._world.comm, f"{words}; allowed are {self.most}, {keep}")
         else:
             self._hard_left -= 1
             self._place.make(HARD)

@@ -31,7 +31,7 @@ def on_a_plane(slope=0.0, rolling=0.0, spinning=0.0, velocity=(0, 0, 0), angular
     return scene
 
 
-@pytest.mark.parametrize("solver", ["apgd", "conic"])
+@pytest.mark.parametrize("solver", ["apgd", pytest.param("conic", marks=pytest.mark.slow)])
 def test_a_sphere_rolls_to_rest(solver):
     """v falls by 5/7 g rho / R: m v' = -F, and I v' / R = F R - rho m g."""
     rho, v, dt = 0.004, 0.5, 0.01

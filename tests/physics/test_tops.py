@@ -256,8 +256,9 @@ def lost(kind, floor, dt, time=0.1):
 
 
 @pytest.mark.parametrize(("kind", "floor"), [
-    ("cone", Plane((0, 0, 1))), ("cone", Box((1, 1, 0.1), (0, 0, -0.1))), ("cone", Sphere(1.0, (0, 0, -1))),
-    ("cube", Plane((0, 0, 1))), ("cube", Sphere(1.0, (0, 0, -1))),
+    pytest.param("cone", Plane((0, 0, 1)), marks=pytest.mark.slow), ("cone", Box((1, 1, 0.1), (0, 0, -0.1))),
+    pytest.param("cone", Sphere(1.0, (0, 0, -1)), marks=pytest.mark.slow),
+    pytest.param("cube", Plane((0, 0, 1)), marks=pytest.mark.slow), ("cube", Sphere(1.0, (0, 0, -1))),
 ])  # fmt: skip
 def test_a_top_with_a_sharp_tip_keeps_its_energy(kind, floor):
     """It turns by .2 radians in a step, and its loss is of second order in dt."""

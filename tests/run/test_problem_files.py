@@ -108,7 +108,7 @@ def test_hard_problems_are_kept_and_the_steps_say_so(program, settled, tmp_path)
 
 def test_a_hard_problem_of_very_many_contacts_is_not_written_unasked(program, settled, tmp_path, monkeypatch):
     monkeypatch.setattr(Dump, "most", 10)
-    with pytest.warns(UserWarning, match="more than are written unasked; allowed are 10, or -dump_problem"):
+    with pytest.warns(UserWarning, match="more than are written unasked; allowed are 10, unless the run keeps all"):
         program(*HARD, "-steps", 2, "-dump_problem", "all")
     assert [line["hard_problem"] for line in steps_of(tmp_path / "results")] == ["", ""]
     assert not (tmp_path / "results" / "hard").exists()
