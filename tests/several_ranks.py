@@ -1,10 +1,10 @@
 """Tests on several ranks, all those of one number of ranks in one start of mpiexec.
 
 `@pytest.mark.parallel(1, 2, 3)` runs a test on 1 and on 3 ranks, and on 2 among the slow tests. Its communicator is
-`MPI.COMM_WORLD`; its argument `ranks`, if it has one, is the number. On one rank it is a test as any other. On more, the
-first such test that comes up starts `mpiexec -n 3 python -m pytest` with all tests on 3 ranks that were selected; every
-rank runs them in the same order and writes down how they ended, and the session that was started by hand reports that,
-test by test. A test on which a rank fails, dies or hangs ends that start, and another one goes on behind it.
+`MPI.COMM_WORLD`; its argument `ranks`, if it has one, is the number. On one rank it is a test as any other. On more,
+the first such test that comes up starts `mpiexec -n 3 python -m pytest` with all tests on 3 ranks that were selected;
+every rank runs them in the same order and writes down how they ended, and the session that was started by hand reports
+that, test by test. A test on which a rank fails, dies or hangs ends that start, and another one goes on behind it.
 
 Workers of pytest-xdist share the results: the first that needs them makes them.
 """

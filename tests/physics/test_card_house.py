@@ -28,7 +28,9 @@ def sunk(angle, friction, yaw):
     return 1.0 - sim.positions[:, 2].min() / place[2]
 
 
-@pytest.mark.parametrize(("angle", "yaw"), [pytest.param(15, 0.0, marks=pytest.mark.slow), (22, 0.7), pytest.param(30, -2.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("angle", "yaw"), [
+    pytest.param(15, 0.0, marks=pytest.mark.slow), (22, 0.7), pytest.param(30, -2.0, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_cards_stand_with_a_tenth_more_friction_than_statics_asks_for_and_fall_with_a_tenth_less(angle, yaw):
     """Feet and ridge are on the inner faces; by symmetry the force at the ridge is level. The moment of a card about
     its foot: H 2 L cos(a) = W (L sin(a) - t cos(a)), and friction has to give H of W."""
