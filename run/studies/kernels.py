@@ -103,7 +103,7 @@ def gauss(factor: float, width: float) -> Kernel:
 
 def nineteen() -> Systems:
     """The kernels with a product by FFT. A nugget of 1 makes an integral equation of the second kind."""
-    small, large, cube, row, odd = (64, 64), (100, 100), (16, 16, 16), (2**12,), (97, 103)
+    small, large, cube, row, odd = (128, 128), (256, 256), (32, 32, 32), (2**14,), (193, 207)
     return {
         "log1": lambda: radial(large, log(100), 1.0),
         "log3": lambda: radial(large, log(1), 1e-3),
@@ -117,13 +117,13 @@ def nineteen() -> Systems:
         "yukawa1": lambda: radial(cube, yukawa(1, 1), 1e-3),
         "yukawa10": lambda: radial(cube, yukawa(10, 1), 1e-5),
         "yukawa50": lambda: radial(cube, yukawa(50, 1), 1e-6),
-        "laplace3": lambda: fractional(64, 0.3),
-        "laplace7": lambda: fractional(64, 0.7),
+        "laplace3": lambda: fractional(128, 0.3),
+        "laplace7": lambda: fractional(128, 0.7),
         "imq1": lambda: radial(row, multiquadric(1), h=1.0),
         "imq3": lambda: radial(row, multiquadric(3), h=1.0),
         "wendland": lambda: radial(row, wendland(30), h=1.0),
-        "gauss_odd": lambda: radial(odd, gauss(100, 0.1), 1.0, 1 / 100),
-        "exp_odd": lambda: radial(odd, exponential(0.02), 0.1, 1 / 100),
+        "gauss_odd": lambda: radial(odd, gauss(100, 0.1), 1.0, 1 / 200),
+        "exp_odd": lambda: radial(odd, exponential(0.02), 0.1, 1 / 200),
     }
 
 
@@ -328,8 +328,8 @@ def write_page(found: dict[str, dict[str, Row]], said: dict[str, list[str]], abo
 TEXT = """`run/study kernels` writes this section: CG to a true residual of {rtol:g}, the same matrices and right
 sides in every column. Cells have CPU seconds of set-up and solution (iterations), or what {most} iterations left; one
 thread of an {cpu}, commit {commit}. The fastest is bold. "auto" is `TensorTrain` by its defaults, block
-Nystrom has {columns} columns. Jacobi is as CG alone: diagonals are constant. Systems are small, so that all take
-minutes; trials and set-up of "auto" take 0.03 to 0.08 s here, which pays for larger ones.
+Nystrom has {columns} columns. Jacobi is as CG alone: diagonals are constant. Trials and set-up of "auto"
+pay where CG takes longer than these.
 
 {table}
 
@@ -342,15 +342,15 @@ Iterations are the KSP's own.
 
 """
 WORDS = {
-    "log1": "I + 100 log r, 100^2", "log3": "log r + 1e-3, 100^2", "log5": "log r + 1e-5, 100^2",
-    "exp02": "exp l=0.02, nugget 0.01, 64^2", "exp05": "exp l=0.05, nugget 0.01, 100^2",
-    "exp1": "exp l=0.1, nugget 0.01, 64^2", "matern_small": "Matern 3/2 l=0.02, nugget 0.01, 64^2",
-    "matern_large": "Matern 3/2 l=0.02, nugget 0.01, 100^2", "yukawa1000": "I + 1000 Yukawa k=10, 16^3",
-    "yukawa1": "Yukawa k=1, nugget 1e-3, 16^3", "yukawa10": "Yukawa k=10, nugget 1e-5, 16^3",
-    "yukawa50": "Yukawa k=50, nugget 1e-6, 16^3", "laplace3": "(-Laplace)^0.3, 64^2",
-    "laplace7": "(-Laplace)^0.7, 64^2", "imq1": "inverse multiquadric 1h, 4096",
-    "imq3": "inverse multiquadric 3h, 4096", "wendland": "Wendland C2 30h, 4096",
-    "gauss_odd": "I + 100 Gauss w=0.1, 97 x 103", "exp_odd": "exp l=0.02, nugget 0.1, 97 x 103",
+    "log1": "I + 100 log r, 256^2", "log3": "log r + 1e-3, 256^2", "log5": "log r + 1e-5, 256^2",
+    "exp02": "exp l=0.02, nugget 0.01, 128^2", "exp05": "exp l=0.05, nugget 0.01, 256^2",
+    "exp1": "exp l=0.1, nugget 0.01, 128^2", "matern_small": "Matern 3/2 l=0.02, nugget 0.01, 128^2",
+    "matern_large": "Matern 3/2 l=0.02, nugget 0.01, 256^2", "yukawa1000": "I + 1000 Yukawa k=10, 32^3",
+    "yukawa1": "Yukawa k=1, nugget 1e-3, 32^3", "yukawa10": "Yukawa k=10, nugget 1e-5, 32^3",
+    "yukawa50": "Yukawa k=50, nugget 1e-6, 32^3", "laplace3": "(-Laplace)^0.3, 128^2",
+    "laplace7": "(-Laplace)^0.7, 128^2", "imq1": "inverse multiquadric 1h, 16384",
+    "imq3": "inverse multiquadric 3h, 16384", "wendland": "Wendland C2 30h, 16384",
+    "gauss_odd": "I + 100 Gauss w=0.1, 193 x 207", "exp_odd": "exp l=0.02, nugget 0.1, 193 x 207",
 }  # fmt: skip
 
 
