@@ -47,7 +47,6 @@ DEEP = 0.005
 #: is the guest.
 RANK = np.array([0, 3, 9, 1, 5, 6, 4, 2])
 
-
 Forms = tuple[Ints, Ints, Floats, Floats]  #: kind, row, size, radius of `dem.contact.primitives.Primitives`
 Poses = tuple[Floats, Floats]  #: their centres and quaternions
 
@@ -59,6 +58,7 @@ class Course(NamedTuple):
     velocity: Floats  #: (rows, 6) [m/s, rad/s]
     moves: Bools  #: (rows,) which of them impulses move
     dt: float  #: [s]
+
 
 Moving = tuple[Floats, Floats, Bools, float]  #: a `Course`
 Touching = tuple[Floats, Floats, Floats]  #: a `Touch`
@@ -110,10 +110,10 @@ def turn_ahead(
 ) -> tuple[Floats, Floats, Floats, Ints]:  # fmt: skip
     """Give contacts (nc,) of the pairs of rows i, j (m,) of the shapes the normals of the end of a step and the places
     of its start, of bodies of prescribed motion those of its end: `point` is as seen from the present place of body i.
-    Returns (nc, 3) from body j to where it is relative to i for that [m]; by how much (nc, 3) the mean
-    velocities of surfaces along each other, of j relative to i, differ from those with these arms [m/s]; and the gaps
-    (nc,) from which gaps that are linear in the velocities lead to those of the end [m]. Contacts of guests in the
-    places of `seen_from` get these as their `gap`; returns also which of them overlap by more than DEEP so.
+    Returns (nc, 3) from body j to where it is relative to i for that [m]; by how much (nc, 3) the mean velocities of
+    surfaces along each other, of j relative to i, differ from those with these arms [m/s]; and the gaps (nc,) from
+    which gaps that are linear in the velocities lead to those of the end [m]. Contacts of guests in the places of
+    `seen_from` get these as their `gap`; returns also which of them overlap by more than DEEP so.
 
     `arcs` (nc, 4, 3) are as of `dem.contact.convex.arcs_of`; empty without such shapes."""
     (kind, row, size, _), (center, quaternion) = forms, poses

@@ -17,7 +17,6 @@ from dem.quaternion import cross, length
 #: Rows i, j (m,) of `Primitives`, of which i has the lower number, and the gaps (m,) within which their margins meet.
 Pairs = tuple[Ints, Ints, Floats]
 
-
 #: The `Rows` of grains: start and other; their margins (grains + ghosts,) [m], and which of them have pairs that count.
 Grains = tuple[Ints, Ints, Floats, Bools]
 
