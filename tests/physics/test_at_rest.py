@@ -77,13 +77,13 @@ def at_rest(scene, seconds, begin, **settings):
 @pytest.mark.parametrize(
     ("scene", "most"),
     [
-        (column(), 12),
-        (tower(*[1000.0] * 16), 12),
-        (tower(1000.0, 3e5), 12),
+        (column(), 36),
+        (tower(*[1000.0] * 16), 36),
+        (tower(1000.0, 3e5), 36),
         (tower(1000.0, 3e6), 60),
-        (tower(1000.0, 0.3), 12),
-        (tower(1000.0, 1000.0, 1000.0, 4e4), 12),
-        (overhang(0.93), 25),
+        (tower(1000.0, 0.3), 36),
+        (tower(1000.0, 1000.0, 1000.0, 4e4), 36),
+        (overhang(0.93), 36),
     ],
     ids=["column", "tower", "1:300", "1:3000", "light on heavy", "heaviest on top", "overhang"],
 )
@@ -93,7 +93,7 @@ def test_the_floor_bears_the_weight_in_every_step_and_nothing_creeps(scene, most
     assert share.std() < 1e-3  # 0.03 to 0.3 where steps stop as soon as the limits are met
     assert creep < 1e-6
     assert energy < 1e-9
-    assert iterations < most  # and 15 to 80
+    assert iterations < most  # with the 24 of APGD before those of the conic method
     assert sim.figures["unbalanced_force"] < 1e-3
 
 

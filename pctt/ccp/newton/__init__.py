@@ -102,6 +102,10 @@ class Newton:
         assert self._linear is not None
         return self._linear
 
+    def may_eliminate(self, problem: ConeProblem) -> bool:
+        """Whether an order of elimination is looked for at all."""
+        return self.own and has_few(problem)
+
     def has_elimination(self, problem: ConeProblem) -> bool:
         """Whether the systems of this problem are solved by elimination."""
         return self._look(problem.by_rows())[1] is not None
