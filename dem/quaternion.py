@@ -1,6 +1,6 @@
 """Unit quaternions (w, x, y, z) as rotations from the body frame to the world frame.
 
-Every function but `integrate` works on stacks: quaternions have shape (..., 4), vectors (..., 3).
+Every public function but `integrate` works on stacks: quaternions have shape (..., 4), vectors (..., 3).
 """
 
 from __future__ import annotations
@@ -64,17 +64,19 @@ def rotate(q: Floats, v: Floats) -> Floats:
 
 def matrix(q: Floats) -> Floats:
     """Rotation matrices (..., 3, 3) from the body frame to the world frame."""
-    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    out = np.empty(q.shape[:-1] + (3, 3))
-    out[..., 0, 0] = 1 - 2 * (y * y + z * z)
-    out[..., 0, 1] = 2 * (x * y - w * z)
-    out[..., 0, 2] = 2 * (x * z + w * y)
-    out[..., 1, 0] = 2 * (x * y + w * z)
-    out[..., 1, 1] = 1 - 2 * (x * x + z * z)
-    out[..., 1, 2] = 2 * (y * z - w * x)
-    out[..., 2, 0] = 2 * (x * z - w * y)
-    out[..., 2, 1] = 2 * (y * z + w * x)
-    out[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    return _matrices(np.ascontiguousarray(q, dtype=float).reshape(-1, 4)).reshape(q.shape[:-1] + (3, 3))
+
+
+@loop
+def _matrices(q: Floats) -> Floats:
+    out = np.empty((len(q), 3, 3))
+    for n in range(len(q)):
+        w, x, y, z = q[n, 0], q[n, 1], q[n, 2], q[n, 3]
+        out[n, 0, 0], out[n, 1, 1] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z)
+        out[n, 2, 2] = 1 - 2 * (x * x + y * y)
+        out[n, 0, 1], out[n, 1, 0] = 2 * (x * y - w * z), 2 * (x * y + w * z)
+        out[n, 0, 2], out[n, 2, 0] = 2 * (x * z + w * y), 2 * (x * z - w * y)
+        out[n, 1, 2], out[n, 2, 1] = 2 * (y * z - w * x), 2 * (y * z + w * x)
     return out
 
 
