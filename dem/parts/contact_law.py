@@ -55,7 +55,7 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
     @property
     def resists(self) -> bool:
         """Whether contacts of any pair resist rolling or spinning."""
-        return self.moments() is not None
+        return any(law.RESISTS for law in self.acting)
 
     @cached_property
     def attracts(self) -> bool:
@@ -78,8 +78,8 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
             friction = law.cone(self, met, column, friction)
         return friction
 
-    def moments(self) -> tuple[Floats, Floats] | None:
-        return next((found for law in self.acting if (found := law.moments(self)) is not None), None)
+    def moments(self, met: Met) -> tuple[Floats, Floats] | None:
+        return next((found for law in self.acting if (found := law.moments(self, met)) is not None), None)
 
     def keep(self, met: Met, kept: Floats, solved: Solved) -> Floats:
         found = [law.keep(self, met, column, solved) for law, column in self._each(kept) if law.KEEPS]

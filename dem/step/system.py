@@ -134,7 +134,7 @@ class ContactSystem:
             self._attracted = momentum = self.contact_map.momenta(along_normal(-self.attraction))
             self.free_velocity = self.velocity_with(momentum)
             freely += self.contact_map.velocities(momentum)
-        self.resistance = resistance(world, contacts, self.contact_map, self.frame, free)
+        self.resistance = resistance(world, contacts, self.met, self.contact_map, self.frame, free)
         self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
         if self.resistance is not None and self.attraction is not None:
             self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]

@@ -55,6 +55,7 @@ class Law:
     touching: Any = coefficient(checks.between(0.0, 1.0), 1.0)  #: 0: the two never touch, and go through each other
 
     KEEPS: ClassVar[bool] = False  #: whether the law keeps a number of each contact
+    RESISTS: ClassVar[bool] = False  #: whether it resists the turning of bodies against each other
 
     def refuse(self) -> None:
         """ValueError for coefficients that do not go together."""
@@ -83,9 +84,9 @@ class Law:
         """The coefficients of friction (nc,), which were these before."""
         return friction
 
-    def moments(self) -> tuple[Floats, Floats] | None:
-        """Tables of the greatest moments about the tangents and about the normal, over the normal force [m]; None:
-        nothing resists them."""
+    def moments(self, met: Met) -> tuple[Floats, Floats] | None:
+        """The greatest moments (nc,) about the tangents and about the normal, over the normal force [m], if it RESISTS
+        them."""
         return None
 
     def keep(self, met: Met, kept: Floats, solved: Solved) -> Floats:
