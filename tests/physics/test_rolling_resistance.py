@@ -82,7 +82,8 @@ def test_coefficients_are_times_the_effective_radius():
     for radius in (R, 3 * R):
         scene = Scene(0.6, rolling_coefficient=0.05, spinning_coefficient=0.02)
         scene.add_body("plane", [Plane((0, 0, 1))])
-        scene.add_spheres([[0, 0, radius]], radius, DENSITY, velocity=(0.5, 0, 0), angular_velocity=(0, 0.5 / radius, 3.0))
+        spin = (0, 0.5 / radius, 3.0)
+        scene.add_spheres([[0, 0, radius]], radius, DENSITY, velocity=(0.5, 0, 0), angular_velocity=spin)
         with pctt.Simulation(scene, dt=0.01, **EXACT) as sim:
             sim.run(steps=10)
             assert sim.velocities[0, 0] == pytest.approx(0.5 - 5 / 7 * G * 0.05 * sim.time, rel=1e-5)

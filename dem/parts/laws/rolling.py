@@ -1,5 +1,5 @@
-"""Resistance of contacts to rolling and spinning: the greatest moments, over the normal force, are lengths [m], or shares
-of the effective radius 1 / (1/r + 1/r') (Ai, Chen, Rotter, Ooi, Powder Technology 206, 2011)."""
+"""Resistance of contacts to rolling and spinning: the greatest moments, over the normal force, are lengths [m], or
+shares of the effective radius 1 / (1/r + 1/r') (Ai, Chen, Rotter, Ooi, Powder Technology 206, 2011)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Rolling(Law):
         for name in "rolling", "spinning":
             length, share = getattr(self, name), getattr(self, f"{name}_coefficient")
             if np.any((np.asarray(length) > 0.0) & (np.asarray(share) > 0.0)):
-                raise ValueError(f"{name}, a length, and {name}_coefficient, of the radius, are both above zero: give one")
+                raise ValueError(f"{name}, a length, and {name}_coefficient, of the radius, are above zero: give one")
 
     def doubt(self, radius: float) -> str:
         most = max(self.rolling, self.spinning)
