@@ -12,6 +12,8 @@ import numpy as np
 from dem.arrays import Floats
 from dem.compiled import PART, inlined, loop, prange
 
+NUMBERS = 1536  # that stay in the nearest cache, of loops that become vectors
+
 
 @inlined
 def velocity_at(c, arm, body, w):
@@ -304,17 +306,30 @@ def scale_extrapolated(mass, m, last_m, beta, out):
     """out = M^-1 (m + beta (m - last_m)) for the bodies of ``mass``, which is M^-1 in the format of
     `CompactRows.root`."""
     way = m.dtype.type(beta)
-    for i in prange(len(mass)):
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
-            mass, i, extrapolated(m, last_m, way, i, 0), extrapolated(m, last_m, way, i, 1),
-            extrapolated(m, last_m, way, i, 2), extrapolated(m, last_m, way, i, 3),
-            extrapolated(m, last_m, way, i, 4), extrapolated(m, last_m, way, i, 5),
-        )  # fmt: skip
+    if mass.shape[1] == 6:
+        each, now, last, to = mass.ravel(), m.ravel(), last_m.ravel(), out.reshape(out.size)
+        for part in prange((len(each) + NUMBERS - 1) // NUMBERS):
+            a, b = part * NUMBERS, min(part * NUMBERS + NUMBERS, len(each))
+            _scale_numbers(each[a:b], now[a:b], last[a:b], way, to[a:b])
+    else:
+        for i in prange(len(mass)):
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
+                mass, i, extrapolated(m, last_m, way, i, 0), extrapolated(m, last_m, way, i, 1),
+                extrapolated(m, last_m, way, i, 2), extrapolated(m, last_m, way, i, 3),
+                extrapolated(m, last_m, way, i, 4), extrapolated(m, last_m, way, i, 5),
+            )  # fmt: skip
+
+
+@loop
+def _scale_numbers(mass, m, last_m, beta, out):
+    for k in range(len(mass)):
+        out[k] = mass[k] * (m[k] + beta * (m[k] - last_m[k]))
 
 
 @loop
 def energy_of_step(mass, new_m, m, last_m, beta):
-    """d' M^-1 d of d = new_m - (m + beta (m - last_m)), summed in double precision over the bodies of ``mass``."""
+    """d' M^-1 d of d = new_m - (m + beta (m - last_m)), summed in double precision over parts of the bodies of
+    ``mass``."""
     way = m.dtype.type(beta)
     sums = np.zeros((len(mass) + PART - 1) // PART)
     for part in prange(len(sums)):
@@ -324,18 +339,34 @@ def energy_of_step(mass, new_m, m, last_m, beta):
 
 
 @loop
-def _energy_of_part(mass, new_m, m, last_m, way):
+def _energy_of_part(mass, new_m, m, last_m, beta):
     energy = 0.0
+    if mass.shape[1] == 6:
+        each, new, now, last = mass.ravel(), new_m.ravel(), m.ravel(), last_m.ravel()
+        sums = np.zeros(NUMBERS, mass.dtype)
+        for a in range(0, len(each), NUMBERS):
+            b = min(a + NUMBERS, len(each))
+            _add_energies(each[a:b], new[a:b], now[a:b], last[a:b], beta, sums)
+        for k in range(len(sums)):
+            energy += sums[k]
+        return energy
     for i in range(len(mass)):
-        d0 = new_m[i, 0] - extrapolated(m, last_m, way, i, 0)
-        d1 = new_m[i, 1] - extrapolated(m, last_m, way, i, 1)
-        d2 = new_m[i, 2] - extrapolated(m, last_m, way, i, 2)
-        d3 = new_m[i, 3] - extrapolated(m, last_m, way, i, 3)
-        d4 = new_m[i, 4] - extrapolated(m, last_m, way, i, 4)
-        d5 = new_m[i, 5] - extrapolated(m, last_m, way, i, 5)
+        d0 = new_m[i, 0] - extrapolated(m, last_m, beta, i, 0)
+        d1 = new_m[i, 1] - extrapolated(m, last_m, beta, i, 1)
+        d2 = new_m[i, 2] - extrapolated(m, last_m, beta, i, 2)
+        d3 = new_m[i, 3] - extrapolated(m, last_m, beta, i, 3)
+        d4 = new_m[i, 4] - extrapolated(m, last_m, beta, i, 4)
+        d5 = new_m[i, 5] - extrapolated(m, last_m, beta, i, 5)
         v0, v1, v2, v3, v4, v5 = scaled_row(mass, i, d0, d1, d2, d3, d4, d5)
         energy += d0 * v0 + d1 * v1 + d2 * v2 + d3 * v3 + d4 * v4 + d5 * v5
     return energy
+
+
+@loop
+def _add_energies(mass, new_m, m, last_m, beta, sums):
+    for k in range(len(mass)):
+        d = new_m[k] - (m[k] + beta * (m[k] - last_m[k]))
+        sums[k] += mass[k] * (d * d)
 
 
 @loop
