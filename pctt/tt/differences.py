@@ -37,7 +37,7 @@ from pctt.tt.train import Array
 
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
 SHARE, LEAST, MOST = 1 / 40, 24, 4096  # of the points, of which a part has so many at least, and at most
-PART = 0.2  # points of the trials on some parts, over those of a solution: as many kinds are tried, but two at least
+PART = 0.25  # of the cost of a solution, that trials may cost
 SLACK = 1.3  # a preconditioner that costs so many times more than another one on a part is not tried further there
 OUT = 2.0  # one that costs so many times more on all parts so far is not tried on others
 DEAR = 1000.0  # products that a trial may cost
@@ -167,6 +167,19 @@ class Differences:
             here, back, _ = self._along(axis, self.values)
             found.append(float(np.abs(here - back)[1:].max(initial=0.0) / largest))
         return found
+
+    def distance(self, transform: str) -> float:
+        """Of A from the nearest matrix that a "cosine", a "sine" or a "circulant" diagonalises, over the size of A, in
+        Frobenius' norm. That matrix is a projection of A, so the squares of both distances add up."""
+        squares = self.values**2
+        for n in self.shape:
+            s = np.abs(self._signed(n))
+            squares = np.tensordot((n - s) * (1 + (self.even & (s > 0))), squares, 1)
+        if transform == "circulant":
+            near = prod(self.shape) * (self.circulant() ** 2).sum()
+        else:
+            near = (eigenvalues(self, transform)[0] ** 2).sum()
+        return float(max(1 - near / squares.sum(), 0.0) ** 0.5)
 
     def means(self) -> Array:
         """The means (n_1, ..., n_D, b, b) over the signs of the coordinates."""
@@ -365,51 +378,54 @@ def parts(a: Differences) -> list[Differences]:
 def candidates(a: Differences) -> list[Kind]:
     """What may be the best preconditioner, none among them: the most promising transform first.
 
-    A cosine and a sine transform see only the means of a over the signs of coordinates. If a is not even, a circulant
-    is among them in any case.
+    The determinant weighs small eigenvalues, Frobenius' norm large ones, so the best by either is among them. A cosine
+    and a sine transform see only the means of a over the signs of coordinates. If a is not even, circulants are too.
     """
     best = min((COSINE, CIRCULANT, SINE), key=lambda kind: log_determinant(a, kind[0][0]))
-    signs = [CIRCULANT] * (not a.even and best != CIRCULANT)
-    means = MEANS if best != CIRCULANT else ()
-    return [best, NOTHING, *signs, *means, EMBEDDING, *[BLOCK_DIAGONAL] * (a.block > 1)]
+    nearest = min((COSINE, CIRCULANT, SINE), key=lambda kind: a.distance(kind[0][0]))
+    means, signs = MEANS if best != CIRCULANT else (), () if a.even else (CIRCULANT, EMBEDDING)
+    return list(dict.fromkeys([best, NOTHING, *signs, nearest, *means, *[BLOCK_DIAGONAL] * (a.block > 1)]))
 
 
 def choose(a: Differences) -> Choice | None:
     """The preconditioner with which conjugate gradients cost least; None if A is not positive definite.
 
     It is found on small parts of the grid: on lines, on lines that are twice as wide, and on parts with all axes. What
-    costs OUT times as much as another is not tried further, and beside none as many are tried as cost PART of a
-    solution. The smallest sum over all parts wins, so the harder parts count more. If there is no such part, the most
-    promising one is taken.
+    costs OUT times as much as another is not tried further. Beside none as many are tried as cost PART of a solution,
+    which costs as much as on the hardest part at least; on the last parts two are. The smallest sum over all parts
+    wins, so the harder parts count more. If a grid is too small for trials, the most promising one is taken.
     """
     if max(a.aperiodic) <= 1e-12:  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
         return Choice(CIRCULANT, Promise(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
-    kinds, size = candidates(a), prod(a.shape)
-    scores, trials = dict.fromkeys(kinds, 0.0), list[_Trial]()
-    for pieces in (lines(a, 1), lines(a, 2), parts(a)):
+    kinds, size, trials = candidates(a), prod(a.shape), list[_Trial]()
+    for pieces, least in ((lines(a, 1), 0), (lines(a, 2), 0), (parts(a), 2)):
+        solution = max((trial.costs[kinds[0]] for trial in trials), default=inf)
         share = sum(prod(part.shape) for part in pieces) / size
-        if share > PART or len(kinds) == 1:
+        most = max(least, int((PART - _spent(trials, size) / solution) / share))
+        if share > PART or min(most, len(kinds)) < 2:
             continue
-        most = max(2, int(PART / share))
         kinds = kinds[:most] + [NOTHING] * (NOTHING in kinds[most:])
         for part in pieces:
             trial = _Trial.of(part, kinds)
             if trial is None:
                 return None
             trials.append(trial)
-            for kind in kinds:
-                scores[kind] += trial.costs[kind]
+        scores = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}
         kinds = sorted(kinds, key=lambda kind: scores[kind])
         kinds = [kind for kind in kinds if scores[kind] <= OUT * scores[kinds[0]]]
     found = kinds[0]
     if not trials:
         inverse = FastInverse(a, found)
         return Choice(found, Promise(inverse.each, UNTRIED, [1.0])) if inverse.positive else None
-    hard = max((trial for trial in trials if found in trial.runs), key=lambda trial: trial.costs[found])
+    hard = max(trials, key=lambda trial: trial.costs[found]).runs[found]
     alone = max((trial.runs[NOTHING].norms for trial in trials if NOTHING in trial.runs), key=at_least)
-    spent = sum(trial.spent for trial in trials) / size
-    return Choice(found, Promise(hard.runs[found].each, hard.runs[found].norms, alone, spent))
+    return Choice(found, Promise(hard.each, hard.norms, alone, _spent(trials, size)))
+
+
+def _spent(trials: Sequence[_Trial], size: int) -> float:
+    """By trials, in products with the whole matrix of so many points."""
+    return sum(trial.spent for trial in trials) / size
 
 
 class _Trial:

@@ -201,6 +201,20 @@ def test_lines_show_a_period(name) -> None:
     assert count(a, of.choose(a).kind) <= 1.3 * min(count(a, of.NOTHING), count(a, of.CIRCULANT))
 
 
+def test_distances_are_those_of_the_nearest_matrices() -> None:
+    rng = np.random.default_rng(5)
+    a = of.Differences((4, 5), rng.standard_normal((7, 9, 2, 2)))
+    A = dense(a)
+    for transform in ("cosine", "sine"):
+        Q = np.kron(np.kron(basis(4, transform), basis(5, transform)), np.eye(2))
+        blocks = (Q @ A @ Q.T).reshape(20, 2, 20, 2)
+        blocks[range(20), :, range(20)] = 0.0
+        assert a.distance(transform) == pytest.approx(np.linalg.norm(blocks) / np.linalg.norm(A))
+    near = np.take(np.take(a.circulant(), np.r_[:4, -3:0], 0), np.r_[:5, -4:0], 1)
+    apart = np.linalg.norm(A - dense(of.Differences((4, 5), near)))
+    assert a.distance("circulant") == pytest.approx(apart / np.linalg.norm(A))
+
+
 def test_determinants_are_those_of_the_nearest_matrices() -> None:
     for shape, block in (((4, 5), 2), ((5, 4), 1), ((3, 1), 2)):
         a = some(shape, block, False, 5)
