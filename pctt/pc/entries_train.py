@@ -30,6 +30,8 @@ from pctt.tt.inverse import Inverse, invert_positive
 from pctt.tt.train import Array
 from pctt.tt.work import TooMuchWorkError, Work, apply_operations
 
+SMALL = tuple(5 << k for k in range(9))  # ranks that are tried once the limit of operations has ended an attempt
+
 
 class EntriesTrain:
     """`make` makes a preconditioner for a matrix, `times` multiplies with it.
@@ -124,25 +126,32 @@ class EntriesTrain:
     def _make_train(self, P: PETSc.Mat, layout: Layout, limit: float) -> str:
         """Make a train of at most the rank that is asked for; the reason if there is no positive one.
 
-        If the limit of operations ends an attempt that has come to nothing, one with a fourth of the rank follows, to
-        which trains near the limit would be no better.
+        If the limit of operations ends the attempt, others with small ranks follow, each with twice the rank of the
+        last, until it ends one of these too. The train that leaves least is kept, so a large rank is no worse than a
+        small one.
         """
-        first, cap = "", self.rank
-        if self.options.reuse == "none":
-            self.compressed = None
-        while True:
-            why, stopped = self._try_train(P, layout, limit, cap)
-            if not why:
-                return ""
-            first, cap = first or why, cap // 4
-            if not stopped or cap < 5:
-                return first
+        start = None if self.options.reuse == "none" else self.compressed
+        found, why = None, ""
+        for cap in (self.rank, *(r for r in SMALL if r < self.rank)):
+            self.compressed = start
+            failure, stopped = self._try_train(P, layout, limit, cap)
+            why = why or failure
+            left = self.comm.bcast(self.left)
+            if not failure and (found is None or left < found[0]):
+                found = left, self.compressed, self.inverse, self._product
+            asked = cap == self.rank
+            if (not stopped if asked else stopped) or (found is not None and found[0] <= self.options.eps):
+                break
+        if found is None:
+            return why
+        _, self.compressed, self.inverse, self._product = found
+        return ""
 
     def _try_train(self, P: PETSc.Mat, layout: Layout, limit: float, cap: int) -> tuple[str, bool]:
         """Make a train of at most this rank with at most this number of operations.
 
         eps is lowered three times if the train of the matrix or of its inverse is not positive. The result says why
-        there is no positive train, and whether the limit is to blame; ("", False) if there is one.
+        there is no positive train, empty if there is one, and whether the limit has ended it.
         """
         work, eps = Work(limit), self.options.eps
         try:
@@ -159,7 +168,7 @@ class EntriesTrain:
                     if X is not None:
                         self._product = A.product(X.applied)
                         if X.certain or not self._is_negative(P):
-                            return "", False
+                            return "", bool(X.stopped)
                         if X.stopped:
                             return self._too_much(X.stopped, work), True
                         if X.residual > eps:
