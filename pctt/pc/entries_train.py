@@ -81,7 +81,7 @@ class EntriesTrain:
         if options.automatic and options.eps >= options.coarse:
             limit = options.part * self._choose_base(A, P, layout)
         else:
-            product = _product_operations(P, layout, by_fft=True)
+            product = _product_operations(P, layout.digits.shape)
             if multiplies(A) and (options.automatic or 20 * product < options.pays):  # six products are cheap
                 self._iterations = iterations_with_the_diagonal(A, diagonal(P))
             cost = self._iterations * product
@@ -99,7 +99,8 @@ class EntriesTrain:
     def _choose_base(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout) -> float:
         """Choose what is used where no train is; the operations of a solution with it."""
         self.transform = found = DifferencesInverse.best_of(P, layout)
-        product = _product_operations(P, layout, by_fft=found is not None)
+        lattice = self._places.lattice(P.getSize()[0] // P.getBlockSize())
+        product = _product_operations(P, lattice if found is None else layout.digits.shape)
         if found is not None:
             self.promise = found.promise if found.inverse.kind else None
             return (1 + found.promise.each) * product * found.promise.iterations
@@ -277,15 +278,15 @@ class EntriesTrain:
         return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}{stopped}"
 
 
-def _product_operations(P: PETSc.Mat, layout: Layout, by_fft: bool) -> float:
-    """Of a product with P. If P does not show how it multiplies: by FFT on a grid twice as wide, or else as a stored
-    matrix, or in a microsecond per row, as fast multipole methods and H-matrices take."""
-    known = compressed(P)
+def _product_operations(P: PETSc.Mat, grid: tuple[int, ...] | None) -> float:
+    """Of a product with P. If P does not show how it multiplies: by FFT on a grid twice as wide as that of the points,
+    or without a grid as a stored matrix, or in a microsecond per row, as fast multipole methods and H-matrices take."""
+    known, rows = compressed(P), P.getSize()[0]
     if known is not None:
         return apply_operations(known.train)
     if P.getType() in DENSE:
-        return 0.5 * float(P.getSize()[0]) ** 2
-    if not by_fft:
-        return min(0.5 * float(P.getSize()[0]) ** 2, 1e3 * P.getSize()[0])
-    wide = prod(2 * n for n in layout.digits.shape)
+        return 0.5 * float(rows) ** 2
+    if grid is None:
+        return min(0.5 * float(rows) ** 2, 1e3 * rows)
+    wide = prod(2 * n for n in grid)
     return wide * log2(wide)

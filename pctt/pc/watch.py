@@ -56,15 +56,14 @@ class Watch:
         return len(self._alone.norms) - 1 if self._alone else 0
 
     def count(self) -> None:
-        """Collective."""
+        """Collective. PETSc has no norm of this solve before the second application."""
         self._norms.append(self.ksp.getResidualNorm())
         cost = (len(self._norms) - 1) * (1 + self.promise.each)
-        if self._trials + cost <= self._expected or self.solution is not None:
+        if len(self._norms) < 3 or self._trials + cost <= self._expected or self.solution is not None:
             return
         if self._alone is None:
             A = self.ksp.getOperators()[0]
             self._alone = conjugate_gradients(A, self._b.array_r, x=self._start, sign=self._sign)
-        # PETSc has no norm of this solve before the second application
         run, first, last = self._alone, *(self._norms[k] for k in (2, -1))
         gained = log10(first / last) if first > last > 0 else 0.0
         needs = cost * self._digits / gained if gained > 0 else inf
