@@ -32,6 +32,7 @@ LACKS = {
     "morton": "the Mat has no coordinates",
     "rcm": "the Mat has no entries that are stored",
 }
+FILLED = 0.25  # part of a grid that points fill, so that products with it are worth an FFT
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,20 @@ class Places:
     row_at : block row at each point of the grid, on all ranks; None if the block rows are in the order of the points
     points : (n, d) points of this rank's block rows, or None
     source : where the grid, or else the points, come from, in words
+    around : shape of the smallest grid with all points, which need not fill it; None if they are scattered
     """
 
     grid: tuple[int, ...] | None = None
     row_at: Array | None = None
     points: Array | None = None
     source: str = "nothing"
+    around: tuple[int, ...] | None = None
+
+    def lattice(self, count: int) -> tuple[int, ...] | None:
+        """The shape of a grid of two axes at least of which `count` points fill FILLED; None if there is none."""
+        if self.around is None or sum(n > 1 for n in self.around) < 2 or count < FILLED * prod(self.around):
+            return None
+        return self.around
 
 
 def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), told: Array | None = None) -> Places:
@@ -77,10 +86,14 @@ def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), told: Array | None = N
         check_points(points, P, "PCSetCoordinates: points")
     else:
         points, whence = _other_points(fitting, P, comm)
+    around = shape
     if shape is None and points is not None:
-        shape, row_at = _grid_of_points(points, comm)
+        around, row_at = _grid_of_points(points, comm)
+        shape = around if row_at is not None else None
         source = f"the grid of {whence}"
-    return Places(shape, row_at, points, source if shape is not None else whence)
+        if shape is not None and np.array_equal(row_at, np.arange(prod(shape))):
+            row_at = None
+    return Places(shape, row_at, points, source if shape is not None else whence, around)
 
 
 def _on_all(here: bool, comm: MPI.Comm) -> bool:
@@ -190,7 +203,8 @@ def _points_of_modes(P: PETSc.Mat, comm: MPI.Comm) -> Array | None:
 
 
 def _grid_of_points(points: Array, comm: MPI.Comm) -> tuple[tuple[int, ...] | None, Array | None]:
-    """The shape of the grid that points (n, d) of all ranks fill, and the row at each point; None if they fill none."""
+    """The shape of the smallest grid with the points (n, d) of all ranks, None if they are scattered; and the row at
+    each point, None if they do not fill it."""
     count = comm.allreduce(len(points))
     ticks = []
     for axis in points.T:
@@ -204,15 +218,15 @@ def _grid_of_points(points: Array, comm: MPI.Comm) -> tuple[tuple[int, ...] | No
         ticks.append((all_ticks, np.searchsorted(all_ticks, tick)))
     shape = tuple(len(found) for found, _ in ticks)
     if prod(shape) != count:
-        return None, None
+        return shape, None
     places = np.zeros(len(points), np.int64)
     for n, (_, index) in zip(shape, ticks):
         places = places * n + index
     order = np.concatenate(comm.allgather(places))
     rows = np.argsort(order, kind="stable")
     if not np.array_equal(order[rows], np.arange(count)):
-        return None, None  # two rows at one point
-    return shape, None if np.array_equal(rows, np.arange(count)) else rows
+        return shape, None  # two rows at one point
+    return shape, rows
 
 
 def chosen_order(order: str, places: Places, name: str, stored: bool = False, keyed: bool = False) -> str:

@@ -30,6 +30,8 @@ from pctt.tt.inverse import Inverse, invert_positive
 from pctt.tt.train import Array
 from pctt.tt.work import TooMuchWorkError, Work, apply_operations
 
+SMALL = tuple(5 << k for k in range(9))  # ranks that are tried once the limit of operations has ended an attempt
+
 
 class EntriesTrain:
     """`make` makes a preconditioner for a matrix, `times` multiplies with it.
@@ -79,7 +81,7 @@ class EntriesTrain:
         if options.automatic and options.eps >= options.coarse:
             limit = options.part * self._choose_base(A, P, layout)
         else:
-            product = _product_operations(P, layout, by_fft=True)
+            product = _product_operations(P, layout.digits.shape)
             if multiplies(A) and (options.automatic or 20 * product < options.pays):  # six products are cheap
                 self._iterations = iterations_with_the_diagonal(A, diagonal(P))
             cost = self._iterations * product
@@ -97,7 +99,8 @@ class EntriesTrain:
     def _choose_base(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout) -> float:
         """Choose what is used where no train is; the operations of a solution with it."""
         self.transform = found = DifferencesInverse.best_of(P, layout)
-        product = _product_operations(P, layout, by_fft=found is not None)
+        lattice = self._places.lattice(P.getSize()[0] // P.getBlockSize())
+        product = _product_operations(P, lattice if found is None else layout.digits.shape)
         if found is not None:
             self.promise = found.promise if found.inverse.kind else None
             return (1 + found.promise.each) * product * found.promise.iterations
@@ -124,25 +127,32 @@ class EntriesTrain:
     def _make_train(self, P: PETSc.Mat, layout: Layout, limit: float) -> str:
         """Make a train of at most the rank that is asked for; the reason if there is no positive one.
 
-        If the limit of operations ends an attempt that has come to nothing, one with a fourth of the rank follows, to
-        which trains near the limit would be no better.
+        If the limit of operations ends the attempt, others with small ranks follow, each with twice the rank of the
+        last, until it ends one of these too. The train that leaves least is kept, so a large rank is no worse than a
+        small one.
         """
-        first, cap = "", self.rank
-        if self.options.reuse == "none":
-            self.compressed = None
-        while True:
-            why, stopped = self._try_train(P, layout, limit, cap)
-            if not why:
-                return ""
-            first, cap = first or why, cap // 4
-            if not stopped or cap < 5:
-                return first
+        start = None if self.options.reuse == "none" else self.compressed
+        found, why = None, ""
+        for cap in (self.rank, *(r for r in SMALL if r < self.rank)):
+            self.compressed = start
+            failure, stopped = self._try_train(P, layout, limit, cap)
+            why = why or failure
+            left = self.comm.bcast(self.left)
+            if not failure and (found is None or left < found[0]):
+                found = left, self.compressed, self.inverse, self._product
+            asked = cap == self.rank
+            if (not stopped if asked else stopped) or (found is not None and found[0] <= self.options.eps):
+                break
+        if found is None:
+            return why
+        _, self.compressed, self.inverse, self._product = found
+        return ""
 
     def _try_train(self, P: PETSc.Mat, layout: Layout, limit: float, cap: int) -> tuple[str, bool]:
         """Make a train of at most this rank with at most this number of operations.
 
         eps is lowered three times if the train of the matrix or of its inverse is not positive. The result says why
-        there is no positive train, and whether the limit is to blame; ("", False) if there is one.
+        there is no positive train, empty if there is one, and whether the limit has ended it.
         """
         work, eps = Work(limit), self.options.eps
         try:
@@ -159,7 +169,7 @@ class EntriesTrain:
                     if X is not None:
                         self._product = A.product(X.applied)
                         if X.certain or not self._is_negative(P):
-                            return "", False
+                            return "", bool(X.stopped)
                         if X.stopped:
                             return self._too_much(X.stopped, work), True
                         if X.residual > eps:
@@ -268,15 +278,15 @@ class EntriesTrain:
         return f"{self.compressed.words()}; inverse I + Z ranks {X.ranks} residual {self.inverse.residual:.2g}{stopped}"
 
 
-def _product_operations(P: PETSc.Mat, layout: Layout, by_fft: bool) -> float:
-    """Of a product with P. If P does not show how it multiplies: by FFT on a grid twice as wide, or else as a stored
-    matrix, or in a microsecond per row, as fast multipole methods and H-matrices take."""
-    known = compressed(P)
+def _product_operations(P: PETSc.Mat, grid: tuple[int, ...] | None) -> float:
+    """Of a product with P. If P does not show how it multiplies: by FFT on a grid twice as wide as that of the points,
+    or without a grid as a stored matrix, or in a microsecond per row, as fast multipole methods and H-matrices take."""
+    known, rows = compressed(P), P.getSize()[0]
     if known is not None:
         return apply_operations(known.train)
     if P.getType() in DENSE:
-        return 0.5 * float(P.getSize()[0]) ** 2
-    if not by_fft:
-        return min(0.5 * float(P.getSize()[0]) ** 2, 1e3 * P.getSize()[0])
-    wide = prod(2 * n for n in layout.digits.shape)
+        return 0.5 * float(rows) ** 2
+    if grid is None:
+        return min(0.5 * float(rows) ** 2, 1e3 * rows)
+    wide = prod(2 * n for n in grid)
     return wide * log2(wide)

@@ -20,12 +20,12 @@ HOPELESS = 1.2  # times what the KSP takes
 class Watch:
     """A solve by a KSP. `count` is called before each application of the preconditioner.
 
-    Once trials and applications have cost GROWTH times what a trial has promised, or than conjugate gradients alone are
-    known to take, these solve the same system in turns with the KSP, as long as they have cost less than it. They wait
-    where residuals show that they need HOPELESS times what the KSP does, and that this is PATIENCE times its promise at
-    most. If they have the solution first, the KSP ends with its next test, and `solution` is theirs: if they never
-    waited, all is not more than twice what they take alone, plus AT_LEAST. Costs are counted, not measured, and all
-    ranks decide by the same norms.
+    Once trials and applications have cost GROWTH times what a trial has promised, or AT_LEAST more than conjugate
+    gradients alone are known to take, these solve the same system in turns with the KSP, as long as they have cost less
+    than it. They wait where residuals show that they need HOPELESS times what the KSP does, and that this is PATIENCE
+    times its promise at most. If they have the solution first, the KSP ends with its next test, and `solution` is
+    theirs: if they never waited, all is not more than twice what they take alone, plus AT_LEAST. Costs are counted, not
+    measured, and all ranks decide by the same norms.
 
     sign : -1 where the matrix is negative definite
     spent : what trials for this solve have cost, in products
@@ -43,7 +43,7 @@ class Watch:
         self._digits = log10(norm / self._enough) if 0 < self._enough < norm else 16.0 if norm else 0.0
         cost, alone = promise.cost(self._digits), at_least(promise.alone, self._digits)
         self._trials, self._norms = spent, [0.0]
-        self._expected = max(AT_LEAST, min(spent + GROWTH * cost, alone))
+        self._expected = max(AT_LEAST, min(spent + GROWTH * cost, alone + AT_LEAST))
         self._alone: ConjugateGradients | None = None
 
     @staticmethod
@@ -56,15 +56,14 @@ class Watch:
         return len(self._alone.norms) - 1 if self._alone else 0
 
     def count(self) -> None:
-        """Collective."""
+        """Collective. PETSc has no norm of this solve before the second application."""
         self._norms.append(self.ksp.getResidualNorm())
         cost = (len(self._norms) - 1) * (1 + self.promise.each)
-        if self._trials + cost <= self._expected or self.solution is not None:
+        if len(self._norms) < 3 or self._trials + cost <= self._expected or self.solution is not None:
             return
         if self._alone is None:
             A = self.ksp.getOperators()[0]
             self._alone = conjugate_gradients(A, self._b.array_r, x=self._start, sign=self._sign)
-        # PETSc has no norm of this solve before the second application
         run, first, last = self._alone, *(self._norms[k] for k in (2, -1))
         gained = log10(first / last) if first > last > 0 else 0.0
         needs = cost * self._digits / gained if gained > 0 else inf

@@ -108,8 +108,8 @@ def race(runs: Sequence[ConjugateGradients], slack: float, most: float, digits: 
 
     The cheapest so far makes the next step. With a preconditioner a run ends at half of the digits, and costs twice as
     much; without one it gains most of them late, so it goes on. The race ends when all others cost `slack` times as
-    much as the winner, or `most`. What those that have not arrived cost is extrapolated. (Who lags behind at first may
-    win, so nobody is sent home early.)
+    much as the winner, or `most`. What those that have not arrived cost is extrapolated, to as many iterations as there
+    are unknowns at most. (Who lags behind at first may win, so nobody is sent home early.)
     """
     halves = [1.0 if run.solve is None else 0.5 for run in runs]
 
@@ -129,7 +129,7 @@ def race(runs: Sequence[ConjugateGradients], slack: float, most: float, digits: 
             running.remove(k)
             most = min(most, slack * gone(k))
     return [
-        inf if run.failed else iterations(run.norms, half * digits) / half * (1 + run.each)
+        inf if run.failed else min(iterations(run.norms, half * digits) / half, len(run.x)) * (1 + run.each)
         for run, half in zip(runs, halves)
     ]
 

@@ -15,7 +15,11 @@ sign. So errors at the boundary have opposite signs, and a mean of both inverses
 only the mean of a over the signs of the coordinates. If A differs much from it (rotated anisotropy), circulants are
 better, and so is a part of the inverse of the circulant on a grid twice as wide that has A as a part.
 
-Which of them is best, if any, solutions on small parts of the grid show (`choose`).
+
+Each of these matrices C makes the trace of C^-1 A as large as that of I. So the bound of Kaporin (Numer. Linear Algebra
+Appl. 1, 1994), by which conjugate gradients take fewer iterations the smaller trace^N / det is, depends on det C alone:
+of the transforms, the one with the smallest determinant is the best. Whether another preconditioner or none is better
+still, solutions on small parts of the grid show (`choose`).
 """
 
 from __future__ import annotations
@@ -31,16 +35,12 @@ from scipy import fft
 from pctt.tt.conjugate import ConjugateGradients, Promise, at_least, race
 from pctt.tt.train import Array
 
-EPSILON = float(np.finfo(float).eps)
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
-#: Shares of the points of a grid, and the most points, on which solutions are tried: all, then the best of them.
-SHARES = ((1 / 100, 1024), (1 / 40, 4096))
-LEAST, FEWEST, ROWS = 64, 24, 3  # points, if they are a fortieth of all; in any case; rows along a periodic axis
-NEARLY = 0.05  # a periodic function may change so much in a period
-PART = 0.2  # points of all trials, over those of a solution: as many kinds are tried
-PAIR = 0.33  # points of both parts, over all, with which two kinds are tried in any case
-SLACK = 1.3  # a preconditioner that costs so many times more than another one on a part is not tried further
-MOST = 1000.0  # products that a trial may cost
+SHARE, LEAST, MOST = 1 / 40, 24, 4096  # of the points, of which a part has so many at least, and at most
+PART = 0.25  # of the cost of a solution, that trials may cost
+SLACK = 1.3  # a preconditioner that costs so many times more than another one on a part is not tried further there
+OUT = 2.0  # one that costs so many times more on all parts so far is not tried on others
+DEAR = 1000.0  # products that a trial may cost
 UNTRIED = [1.0, 0.5]  # norms that stand for those of a trial
 
 #: What is tried: the transforms of which the mean of the inverses is taken, and their shares.
@@ -50,10 +50,8 @@ BLOCK_DIAGONAL: Kind = (("block diagonal", 1.0),)
 CIRCULANT: Kind = (("circulant", 1.0),)
 COSINE: Kind = (("cosine", 1.0),)
 SINE: Kind = (("sine", 1.0),)
-#: What is tried after these, if so many can be.
-MORE: tuple[Kind, ...] = (
-    (("cosine", 0.5), ("sine", 0.5)), (("cosine", 0.75), ("sine", 0.25)), (("embedding", 1.0),),
-)  # fmt: skip
+MEANS: tuple[Kind, ...] = ((("cosine", 0.5), ("sine", 0.5)), (("cosine", 0.75), ("sine", 0.25)))
+EMBEDDING: Kind = (("embedding", 1.0),)
 #: The cost of an application; that of a product with A is 1.
 COSTS = {"block diagonal": 0.0, "circulant": 0.25, "cosine": 0.25, "sine": 0.25, "embedding": 1.0}
 WORDS = {
@@ -170,13 +168,6 @@ class Differences:
             found.append(float(np.abs(here - back)[1:].max(initial=0.0) / largest))
         return found
 
-    def steepness(self, axis: int) -> float:
-        """How much a(s), s not 0, changes at most between neighbours on this axis, relative to the largest a(s)."""
-        values = np.moveaxis(self.values, axis, 0)[: self.shape[axis]]
-        steps = np.abs(np.diff(values, axis=0))
-        steps[(slice(1),) * len(self.shape)] = 0.0
-        return float(steps.max(initial=0.0) / (np.abs(values[1:]).max(initial=0.0) or 1.0))
-
     def distance(self, transform: str) -> float:
         """Of A from the nearest matrix that a "cosine", a "sine" or a "circulant" diagonalises, over the size of A, in
         Frobenius' norm. That matrix is a projection of A, so the squares of both distances add up."""
@@ -188,7 +179,7 @@ class Differences:
             near = prod(self.shape) * (self.circulant() ** 2).sum()
         else:
             near = (eigenvalues(self, transform)[0] ** 2).sum()
-        return float(max(1 - near / squares.sum(), EPSILON) ** 0.5)
+        return float(max(1 - near / squares.sum(), 0.0) ** 0.5)
 
     def means(self) -> Array:
         """The means (n_1, ..., n_D, b, b) over the signs of the coordinates."""
@@ -309,6 +300,17 @@ def eigenvalues(a: Differences, transform: str) -> tuple[Array, float | None]:
     return (values.real if a.block == 1 else values), bound
 
 
+def log_determinant(a: Differences, transform: str) -> float:
+    """Of the nearest matrix to A that a "cosine", a "sine" or a "circulant" diagonalises, per unknown."""
+    values, _ = eigenvalues(a, transform)
+    values = values[..., 0] if a.block == 1 else np.linalg.eigvalsh(values)
+    logs = np.log(np.maximum(values, FLOOR * abs(values).max() or 1.0)).reshape(*values.shape[: len(a.shape)], -1)
+    if transform == "circulant":  # a half of the spectrum
+        n = a.shape[-1]
+        logs = logs * np.where(np.arange(n // 2 + 1) % (n / 2) > 0, 2.0, 1.0)[:, None]
+    return float(logs.sum() / (prod(a.shape) * a.block))
+
+
 def _along_last(a: Array, kind: str) -> Array:
     n = a.shape[-1]
     weighted = np.zeros((*a.shape[:-1], n + 1))
@@ -345,27 +347,27 @@ class Choice:
     promise: Promise
 
 
-def parts(a: Differences, share: float) -> list[Differences]:
-    """Matrices of this share of the points that have their eigenvalues between those of A: of neighbouring points, and
-    of the means of cells of points (times the root of their number).
+def lines(a: Differences, width: int) -> list[Differences]:
+    """Matrices of bundles of lines along each axis, which are so wide in the other axes. They show periods of a."""
+    cells = [min(width, n) for n in a.shape]
+    return [a.part([*cells[:axis], n, *cells[axis + 1 :]]) for axis, n in enumerate(a.shape)]
 
-    The first shows how a behaves near zero, the second how it does far from it, on the whole grid. Periodic axes stay
-    whole, if they are short enough and not constant. A small grid is no smaller part.
+
+def parts(a: Differences) -> list[Differences]:
+    """Matrices of a share of the points that have their eigenvalues between those of A: of neighbouring points, and of
+    the means of cells of points (times the root of their number).
+
+    The first shows how a behaves near zero, the second how it does far from it, on the whole grid. A small grid is no
+    smaller part.
     """
     shape, size = a.shape, prod(a.shape)
-    whole = [far <= NEARLY and ROWS * n <= size / 30 for n, far in zip(shape, a.aperiodic)]
-    whole = [all_ and a.steepness(axis) > NEARLY for axis, all_ in enumerate(whole)]
-    if all(whole):
-        whole = [False] * len(shape)
-    rows = ROWS * prod(n for n, all_ in zip(shape, whole) if all_) if any(whole) else 0
-    points = max(size * share, min(max(size / 40, FEWEST), LEAST), rows)
+    points = min(max(size * SHARE, LEAST), MOST)
     if size <= points:
         return [a]
-    sides, left, axes = list(shape), points / prod(n for n, all_ in zip(shape, whole) if all_), len(shape) - sum(whole)
+    sides, left, axes = list(shape), points, len(shape)
     for k in sorted(range(len(shape)), key=lambda k: shape[k]):
-        if not whole[k]:
-            sides[k] = max(1, min(shape[k], round(left ** (1 / axes))))
-            left, axes = max(1.0, left / sides[k]), axes - 1
+        sides[k] = max(1, min(shape[k], round(left ** (1 / axes))))
+        left, axes = max(1.0, left / sides[k]), axes - 1
     widths = []
     for n, side in zip(shape, sides):
         most = n // side  # a divisor shows all of the grid
@@ -373,57 +375,57 @@ def parts(a: Differences, share: float) -> list[Differences]:
     return [a.part(sides), a.means_of([n // width for n, width in zip(shape, widths)], widths)]
 
 
+def candidates(a: Differences) -> list[Kind]:
+    """What may be the best preconditioner, none among them: the most promising transform first.
+
+    The determinant weighs small eigenvalues, Frobenius' norm large ones, so the best by either is among them. A cosine
+    and a sine transform see only the means of a over the signs of coordinates. If a is not even, circulants are too.
+    """
+    best = min((COSINE, CIRCULANT, SINE), key=lambda kind: log_determinant(a, kind[0][0]))
+    nearest = min((COSINE, CIRCULANT, SINE), key=lambda kind: a.distance(kind[0][0]))
+    means, signs = MEANS if best != CIRCULANT else (), () if a.even else (CIRCULANT, EMBEDDING)
+    return list(dict.fromkeys([best, NOTHING, *signs, nearest, *means, *[BLOCK_DIAGONAL] * (a.block > 1)]))
+
+
 def choose(a: Differences) -> Choice | None:
     """The preconditioner with which conjugate gradients cost least; None if A is not positive definite.
 
-    It is found on small parts of the grid, and on larger ones if some are hardly worse; as many are tried as cost PART
-    of a solution, the nearest in Frobenius' norm first. Costs that have grown count as if they grew once more up to the
-    whole. Few points of a kernel that is not even show a circulant worse than it is, by about as much as it is nearer
-    to the whole, beside a cosine transform. If there is no such part, the nearest is taken.
+    It is found on small parts of the grid: on lines, on lines that are twice as wide, and on parts with all axes. What
+    costs OUT times as much as another is not tried further. Beside none as many are tried as cost PART of a solution,
+    which costs as much as on the hardest part at least; on the last parts two are. The smallest sum over all parts
+    wins, so the harder parts count more. If a grid is too small for trials, the most promising one is taken.
     """
     if max(a.aperiodic) <= 1e-12:  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
         return Choice(CIRCULANT, Promise(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
-    first, *others = sorted((COSINE, CIRCULANT, SINE), key=lambda kind: a.distance(kind[0][0]))
-    kinds, nearer = [first, NOTHING, *others, *MORE, *[BLOCK_DIAGONAL] * (a.block > 1)], _nearer([a])
-    scores: dict[Kind, float] = {}
-    trials: list[_Trial] = []
-    alone, spent = [1.0], 0.0
-    for few, most in SHARES:
-        pieces = parts(a, min(few, most / prod(a.shape)))
-        points = sum(prod(part.shape) for part in pieces)
-        share = points / prod(a.shape)
-        kinds = kinds[: max(2 if share <= PAIR else 1, int(PART / share))]
-        if len(kinds) == 1 or (scores and pieces[0].shape == trials[0].shape):
-            break
-        trials = []
+    kinds, size, trials = candidates(a), prod(a.shape), list[_Trial]()
+    for pieces, least in ((lines(a, 1), 0), (lines(a, 2), 0), (parts(a), 2)):
+        solution = max((trial.costs[kinds[0]] for trial in trials), default=inf)
+        share = sum(prod(part.shape) for part in pieces) / size
+        most = max(least, int((PART - _spent(trials, size) / solution) / share))
+        if share > PART or min(most, len(kinds)) < 2:
+            continue
+        kinds = kinds[:most] + [NOTHING] * (NOTHING in kinds[most:])
         for part in pieces:
             trial = _Trial.of(part, kinds)
             if trial is None:
                 return None
             trials.append(trial)
-        spent += sum(trial.spent for trial in trials)
-        alone = max((alone, *(trial.runs[NOTHING].norms for trial in trials if NOTHING in trial.runs)), key=at_least)
-        costs = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}  # the harder part counts
-        scores = {kind: cost * max(1.0, cost / scores.get(kind, cost)) for kind, cost in costs.items()}
-        lead = 1.0 if a.even else max(1.0, nearer / _nearer(pieces)) ** 1.5
-        order = {kind: scores[kind] / (lead if kind == CIRCULANT else 1.0) for kind in kinds}
-        kinds = sorted(kinds, key=lambda kind: order[kind])
-        kinds = [kind for kind in kinds if order[kind] <= SLACK * order[kinds[0]]]
+        scores = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}
+        kinds = sorted(kinds, key=lambda kind: scores[kind])
+        kinds = [kind for kind in kinds if scores[kind] <= OUT * scores[kinds[0]]]
     found = kinds[0]
     if not trials:
         inverse = FastInverse(a, found)
-        if not inverse.positive:
-            return None
-        return Choice(found, Promise(inverse.each, UNTRIED, alone))
-    hard = max(trials, key=lambda trial: trial.costs[found])
-    return Choice(found, Promise(hard.runs[found].each, hard.runs[found].norms, alone, spent / prod(a.shape)))
+        return Choice(found, Promise(inverse.each, UNTRIED, [1.0])) if inverse.positive else None
+    hard = max(trials, key=lambda trial: trial.costs[found]).runs[found]
+    alone = max((trial.runs[NOTHING].norms for trial in trials if NOTHING in trial.runs), key=at_least)
+    return Choice(found, Promise(hard.each, hard.norms, alone, _spent(trials, size)))
 
 
-def _nearer(pieces: Sequence[Differences]) -> float:
-    """How far the nearest matrices of a cosine transform are, over how far circulants are."""
-    far, near = (sum(part.distance(transform) for part in pieces) for transform in ("cosine", "circulant"))
-    return far / near
+def _spent(trials: Sequence[_Trial], size: int) -> float:
+    """By trials, in products with the whole matrix of so many points."""
+    return sum(trial.spent for trial in trials) / size
 
 
 class _Trial:
@@ -438,7 +440,7 @@ class _Trial:
         b = np.random.default_rng(0).standard_normal(points * a.block)
         solves = {kind: inverse.solve if kind else None for kind, inverse in inverses.items()}
         self.runs = {kind: ConjugateGradients(times, b, solves[kind], inverses[kind].each) for kind in inverses}
-        self.costs = dict(zip(self.runs, race(list(self.runs.values()), SLACK, MOST)))
+        self.costs = dict(zip(self.runs, race(list(self.runs.values()), SLACK, DEAR)))
 
     @classmethod
     def of(cls, a: Differences, kinds: Sequence[Kind]) -> _Trial | None:

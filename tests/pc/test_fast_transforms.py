@@ -268,3 +268,17 @@ def test_at_the_limit_of_operations_the_last_inverse_is_kept(limit):
         its[rank] = solve(ksp)[0]
     assert its[64] <= its[16] + 4  # none takes 28
     assert "the limit of operations" in report(ksp)
+
+
+@pytest.mark.parametrize("limit", [3e7, 1e8])
+def test_a_larger_rank_is_no_worse_at_a_tiny_limit(limit):
+    """Of a kernel with weights on a square; the diagonal takes 56."""
+    n = 30
+    x, y = (np.indices((n, n)).reshape(2, -1) + 0.5) / n
+    r, weight = np.hypot(x[:, None] - x, y[:, None] - y), 10 * x * y + 0.1
+    A = np.eye(n * n) + weight[:, None] * (100 / n**2 * np.exp(-10 * r)) * weight
+    its = []
+    for rank in (10, 20, 40, 70, 100):
+        ksp = ready(shell(lambda i, j: A[i, j], A, grid=(n, n)), rank=rank, setup_limit=limit)
+        its.append(solve(ksp)[0])
+        assert its[-1] <= min(its) + 4

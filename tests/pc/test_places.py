@@ -160,6 +160,21 @@ def test_points_that_fill_a_grid_in_any_order():
     assert np.array_equal(rows[places.row_at], np.arange(60))
 
 
+@pytest.mark.parallel(1, 2)
+def test_points_of_a_disc_lie_on_a_grid():
+    comm = MPI.COMM_WORLD
+    points = np.stack(np.unravel_index(np.arange(400), (20, 20)), axis=1) / 7.0
+    disc = points[np.hypot(*(points - points.mean(axis=0)).T) < 1.4]
+    line = np.stack((points[:100, 0] ** 2 + points[:100, 1], np.zeros(100)), axis=1)
+    for where, known in ((disc, (20, 20)), (disc[::5], None), (line, None)):
+        mat = PETSc.Mat().createAIJ((len(where), len(where)), nnz=1, comm=comm)
+        mat.assemble()
+        mat.setAttr("coordinates", where[slice(*mat.getOwnershipRange())])
+        places = places_of(mat)
+        assert places.lattice(len(where)) == known
+        assert places.grid is None or places.grid == (100, 1)
+
+
 @pytest.mark.parallel(2)
 def test_points_of_another_width_on_one_rank_are_refused():
     """Else the ranks would compare different numbers of axes, and wait for each other."""

@@ -161,3 +161,15 @@ def test_a_wrong_choice_costs_twice_as_much_as_none(kind, entries, monkeypatch):
     solved(ksp, b, 1e-8)
     assert context(ksp).account.setups == 1
     assert len(found) <= 2 * alone + AT_LEAST
+
+
+@pytest.mark.parallel(1, 2)
+def test_trials_may_have_cost_more_than_none(monkeypatch):
+    """Then none are in turns from the first norm of a residual that PETSc knows."""
+
+    def dear(a: of.Differences) -> of.Choice:
+        return of.Choice(of.COSINE, Promise(0.25, [1.0, 1e-8], [1.0], 1000.0))
+
+    monkeypatch.setattr(of, "choose", dear)
+    A = from_differences(smooth, (60, 50))
+    solved(ready(A, rtol=1e-8), right_side(A, "random"), 1e-8)

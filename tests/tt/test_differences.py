@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -158,11 +160,11 @@ def test_the_best_share_is_chosen() -> None:
     t = 2 - 2 * np.cos(2 * np.pi * np.arange(512) / 512)
     fractional = np.fft.irfft2((t[:, None] + t[:257]) ** 0.7)[:160, :160]
     a = of.Differences.of_even(fractional)
-    kinds = of.COSINE, of.SINE, of.CIRCULANT, *of.MORE
+    kinds = of.COSINE, of.SINE, of.CIRCULANT, *of.MEANS, of.EMBEDDING
     assert count(a, of.choose(a).kind) <= 1.25 * min(count(a, kind) for kind in kinds)
 
 
-@pytest.mark.parametrize(("n", "power"), [(48, 0.65), (57, 0.8)])
+@pytest.mark.parametrize(("n", "power"), [(44, 0.65), (48, 0.65), (52, 0.65), (57, 0.8)])
 def test_a_small_laplacian_has_a_sine_transform(n: int, power: float) -> None:
     t = 2 - 2 * np.cos(2 * np.pi * np.arange(512) / 512)
     a = of.Differences.of_even(np.fft.irfft2((t[:, None] + t[:257]) ** power)[:n, :n])
@@ -175,11 +177,28 @@ def test_parts_show_a_function_of_one_coordinate() -> None:
     values = np.broadcast_to(season[:, None, None], (13, 16, 18)).copy()
     values[0, 0, 0] += 0.3
     a = of.Differences.of_even(values)
-    for part in of.parts(a, 0.01):
+    for part in of.parts(a):
         assert min(part.shape) > 2
         assert np.prod(part.shape) <= 0.1 * values.size
     found = of.choose(a).kind
     assert count(a, found) <= 1.5 * min(count(a, of.NOTHING), count(a, of.CIRCULANT))  # 18 and 24: rounding decides
+
+
+SEASONS = {  # shape, period along the last axis, and correlation lengths along both
+    "nearly of the grid": ((24, 122), 30.4, (8, inf)), "not of the grid": ((40, 200), 29.53, (8, inf)),
+    "damped": ((24, 122), 30.4, (8, 90)), "longer than the grid": ((30, 90), 95.0, (5, inf)),
+    "short": ((40, 140), 7.02, (8, inf)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SEASONS)
+def test_lines_show_a_period(name) -> None:
+    """Which neither a few neighbouring points do nor means over cells."""
+    shape, period, lengths = SEASONS[name]
+    x, t = offsets(*shape)
+    season = np.exp(-2 * np.sin(np.pi * t / period) ** 2)
+    a = kernel(np.exp(-abs(x) / lengths[0] - abs(t) / lengths[1]) * season, 0.05)
+    assert count(a, of.choose(a).kind) <= 1.3 * min(count(a, of.NOTHING), count(a, of.CIRCULANT))
 
 
 def test_distances_are_those_of_the_nearest_matrices() -> None:
@@ -194,6 +213,16 @@ def test_distances_are_those_of_the_nearest_matrices() -> None:
     near = np.take(np.take(a.circulant(), np.r_[:4, -3:0], 0), np.r_[:5, -4:0], 1)
     apart = np.linalg.norm(A - dense(of.Differences((4, 5), near)))
     assert a.distance("circulant") == pytest.approx(apart / np.linalg.norm(A))
+
+
+def test_determinants_are_those_of_the_nearest_matrices() -> None:
+    for shape, block in (((4, 5), 2), ((5, 4), 1), ((3, 1), 2)):
+        a = some(shape, block, False, 5)
+        size = np.prod(shape) * block
+        for transform in ("cosine", "sine", "circulant"):
+            inverse = of.FastInverse(a, ((transform, 1.0),)).solve(np.eye(size))
+            found = of.log_determinant(a, transform)
+            assert found == pytest.approx(-np.linalg.slogdet(inverse)[1] / size)
 
 
 @pytest.mark.parametrize("a", [[1.0, 2.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0]])
