@@ -144,8 +144,8 @@ def advance(
     contacts; `kept` (owned, 6) are those with which they go into the next step, if they are others. Collective.
 
     x <- x + dt (v + E x) + lag, q <- exp(dt w) q, with the rate E of a cell that changes its size, and the lag
-    (grains, 3) of `Contacts` [m]. The next search begins with the lists of this one, and the balancer goes by the
-    contacts that grains own.
+    (grains, 3) of `Contacts` [m]; grains outside of a sheared cell go with the images there. The next search begins
+    with the lists of this one, and the balancer goes by the contacts that grains own.
     Prescribed motions are followed exactly, whatever dt.
     """
     dt, start, of_large = free.dt, world.grains.position, large_velocity(world, free, velocity)
@@ -161,7 +161,8 @@ def advance(
         world.grains.position = world.grains.position + dt * world.cell.rate * start
     if free.applied is not None:
         world.memory = free.applied.memory
-    world.cell = world.cell.after(dt)
+    then, world.cell = world.cell, world.cell.after(dt)
+    world.grains.velocity = world.cell.taken_along(then, start, world.grains.velocity)
     world.time += dt
     world.step += 1
     world.put_large(free.poses)
@@ -240,9 +241,9 @@ def find_turned(
         return None
     end = find_contacts(advanced(world, free, contacts, velocity), 0.0)
     end = end.take(end.gap < -depth)
-    table = velocities_about(contacts, velocity, large_velocity(world, free, velocity))
-    foreseen = _foreseen(world, contacts, table, dt, end.key)
-    start, approach = _at_start(world, end, dt)
+    large = large_velocity(world, free, velocity)
+    foreseen = _foreseen(world, contacts, velocities_about(contacts, velocity, large), dt, end.key)
+    start, approach = _at_start(world, end, velocities_about(end, velocity, large), dt)
     overlap = -(dt * gap_velocities(world, start, dt, recovery_speed)[2] + approach)
     a, b, known = _rows_in(contacts, end)
     missed = known & (overlap > depth) & (end.gap < foreseen - depth)
@@ -301,9 +302,9 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
     return fast and not not_finite
 
 
-def _at_start(world: World, end: Contacts, dt: float) -> tuple[Contacts, Floats]:
-    """The contacts of the end of a step as contacts of its start, and by how much (nc,) their gaps grow in it [m]."""
-    velocity = end.near.bodies.velocity
+def _at_start(world: World, end: Contacts, velocity: Floats, dt: float) -> tuple[Contacts, Floats]:
+    """The contacts of the end of a step with these velocities (rows, 6) as contacts of its start, and by how much (nc,)
+    their gaps grow in it [m]."""
     start = replace(end, point=end.point - 0.5 * dt * (velocity[end.a, :3] + velocity[end.b, :3]))
     position = end.near.bodies.position - dt * velocity[:, :3]
     flow = end.flow(world.cell, end.near.bodies.position)
