@@ -21,11 +21,11 @@ def stress(sample: Sample, region: Region | Bools, volume: float | None = None) 
     end = ends(sample)
     if isinstance(region, (Block, Cylinder)):
         row, point, branch = branches(sample, end, *region.bounds)
-        part, force, volume = region.part(point, point + branch), end.force[row], region.volume
+        part, force, volume = region.part(point, point + branch), end.force.take(row, axis=0), region.volume
     else:
         part, force, branch = _everywhere(sample, region)[end.grain], end.force, end.center - end.point
         volume = _volume(volume)
-    return summed(sample, np.einsum("e,ea,eb->ab", part, force, branch)) / volume
+    return summed(sample, (part[:, None] * force).T @ branch) / volume
 
 
 def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None = None) -> Floats:

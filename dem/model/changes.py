@@ -38,7 +38,9 @@ def change(world: World, what: str, **values: Any) -> None:
     refuse_functions(what, values)
     if kind == "cell":
         _refuse_others(what, values, world.cell.CHANGED)
-        world.cell = world.cell.changed(world.time, **values)
+        then, grains = world.cell, world.grains
+        world.cell = then.changed(world.time, **values)
+        grains.velocity = world.cell.taken_along(then, grains.position, grains.velocity)
     elif kind == "body":
         _change_body(world, name, **values)
     else:

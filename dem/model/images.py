@@ -17,7 +17,7 @@ import numpy as np
 from dem import bodies, quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.exchange import greatest, on_any
-from dem.model.neighbourhood import Neighbourhood, chunk_boxes, touched
+from dem.model.neighbourhood import Neighbourhood, chunk_boxes, seen_by
 from dem.model.world import World
 from dem.parts.cell import Cell
 from dem.shapes import Plane, placed
@@ -138,13 +138,10 @@ def images(world: World, near: Neighbourhood) -> Images:
     own = chunk_boxes(position[: near.grains], radius[: near.grains], 8)
     large = _boxes(world)
     steps, across = cell.images()
-    found = [np.zeros(0, np.int64)]  # of the bodies themselves
-    for way in cell.ways[1:]:
-        rows = touched(position + way, radius, own[None])[0]
-        if len(large):
-            of_large = touched(position[: near.grains] + way, radius[: near.grains], large[None])[0]
-            rows = np.union1d(rows, of_large)
-        found.append(rows)
-    which = np.repeat(np.arange(len(steps)), [len(rows) for rows in found])
-    source, steps, across = np.concatenate(found), steps[which], across[which]
+    seen = seen_by(position, radius, cell.ways, own[None])[0]
+    if len(large):
+        seen[:, : near.grains] |= seen_by(position[: near.grains], radius[: near.grains], cell.ways, large[None])[0]
+    seen[0] = False  # the bodies themselves
+    which, source = seen.nonzero()
+    steps, across = steps[which], across[which]
     return Images(source, steps, across, cell.moved(steps, across), count)

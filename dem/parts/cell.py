@@ -109,10 +109,18 @@ class Cell(Named):
         return number + (place - length * number >= length)  # a negative number that rounding makes a period
 
     def leaves(self, position: Floats) -> bool:
-        """Whether one of the positions (n, 3) is further outside than a quarter of a period. In a sheared cell that
-        changes its size none may be outside: where the length along the gradient changes, so does its velocity."""
-        far = 0.0 if self.deforms and self.gradient is not None else 0.25
-        return bool(((np.maximum(-position, position - self.period) > far * self.period) & self.axes).any())
+        """Whether one of the positions (n, 3) is further outside than a quarter of a period."""
+        return bool(((np.maximum(-position, position - self.period) > 0.25 * self.period) & self.axes).any())
+
+    def taken_along(self, then: Cell, position: Floats, velocity: Floats) -> Floats:
+        """Velocities (n, 6) of bodies that had them at these positions (n, 3) in the cell `then`: behind a sheared
+        boundary they go with the images there, whose speed changes with the shear rate and the period."""
+        faster = self.speed - then.speed
+        if not faster or not (crossed := then._crossed(position)).any():
+            return velocity
+        out = velocity.copy()
+        out[:, 0] += faster * crossed
+        return out
 
     def whole(self, way: Floats) -> Floats:
         """The part (..., 3) of ways (..., 3) that is whole periods [m]; without it, ways lead to the nearest image."""
@@ -162,17 +170,15 @@ class Cell(Named):
         if not self.moves:
             return self
         stretch = 1.0 + dt * self.rate
-        return replace(self, period=self.period * stretch, shift=(self.shift + dt * self.speed) * float(stretch[0]))
+        return replace(self, period=self.period * stretch, shift=self.shift * float(stretch[0]) + dt * self.speed)
 
     def before(self, dt: float) -> Cell:
         """The cell at the start of the step of dt [s] that has led to this one."""
         if not self.moves:
             return self
         stretch = 1.0 + dt * self.rate
-        period, shift = self.period / stretch, self.shift / float(stretch[0])
-        if self.gradient is not None:
-            shift -= dt * self.shear_rate * float(period[self.gradient])
-        return replace(self, period=period, shift=shift)
+        then = replace(self, period=self.period / stretch)
+        return replace(then, shift=(self.shift - dt * then.speed) / float(stretch[0]))
 
     def beside_flow(self, position: Floats, velocity: Floats) -> Floats:
         """Linear velocities (n, 3) beside those of the shear at these positions (n, 3) [m/s]."""

@@ -13,7 +13,7 @@ from dem.arrays import Bools, Floats
 from dem.bodies import PLANE, SPHERE, Bodies
 from dem.contact.primitives import primitives, touches
 from dem.geometry.insertion import inserted
-from dem.model.neighbourhood import Neighbourhood, touched
+from dem.model.neighbourhood import Neighbourhood, seen_by
 from dem.model.partition import redistribute
 from dem.model.world import World
 from dem.parts.sources import MOST_IDS, Source, bounds, reach
@@ -91,8 +91,7 @@ def _about(world: World, sources: list[Source]) -> tuple[Floats, Floats]:
     largest = np.array([reach(source.extremes()).max() for source in sources])
     boxes += np.array([-1.0, 1.0])[None, :, None] * largest[:, None, None]
     position, radius = world.cell.wrapped(world.grains.position), reach(world.grains)
-    found = [touched(position + way, radius, boxes[None])[0] for way in world.cell.ways]
-    rows = np.unique(np.concatenate(found)).astype(np.int64)
+    rows = seen_by(position, radius, world.cell.ways, boxes[None])[0].any(axis=0).nonzero()[0]
     parts = world.comm.gather((world.grains.id[rows], position[rows], radius[rows]))
     if parts is None:
         return np.zeros((0, 3)), np.zeros(0)

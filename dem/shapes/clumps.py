@@ -44,6 +44,11 @@ class ClumpForm(Form):
         return {"centres": self.center.tolist(), "radii": self.radius.tolist()}
 
 
+def arm(form: Form) -> float:
+    """How far the centre of a sphere of a clump is from that of the clump, at most; 0 of other forms [m]."""
+    return float(np.linalg.norm(form.center, axis=1).max()) if isinstance(form, ClumpForm) else 0.0
+
+
 @cache
 def form(shape: Clump) -> ClumpForm:
     """The form of a clump; the same object for equal clumps."""

@@ -54,9 +54,8 @@ def _motion(world: World) -> tuple[Floats, float]:
     return stress, float(np.sqrt(6.0 / np.pi * mass / size))
 
 
-def cell_of(world: World, contacts: Contacts, frame: Floats, dt: float) -> CellStep | None:
-    """How the cell takes part in a step from contacts with the frames (nc, 3, 3); None where its size is constant;
-    collective."""
+def cell_of(world: World, dt: float) -> CellStep | None:
+    """How the cell takes part in a step; None where its size is constant; collective."""
     cell = world.cell
     if not cell.deforms:
         return None
@@ -70,5 +69,4 @@ def cell_of(world: World, contacts: Contacts, frame: Floats, dt: float) -> CellS
     root = np.where(follows, 1.0 / np.sqrt(eta * dt * cell.volume), 0.0)
     kept = np.clip(KEPT * cell.rate, -leads, leads)
     free = np.where(follows, kept + (np.diag(stress) - asked) / eta, np.nan_to_num(given))
-    way = contacts.way(contacts.near.bodies.position)
-    return CellStep((frame * way[:, None]).reshape(-1, 9), root, free)
+    return CellStep(root, free)

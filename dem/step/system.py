@@ -122,11 +122,12 @@ class ContactSystem:
         self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
         if self.surface is not None:
             self.b[:, 1:] = self.surface
-        self.cell = cell_of(world, contacts, self.frame, dt)
+        self.cell = cell_of(world, dt)
         if self.cell is not None:
             mass = CellMass(world.comm, self.contact_map.given.root, self.cell)
             self.contact_map = self.contact_map.with_mass(mass)
-            mass.add_flow(self.cell.free, freely)
+            way = contacts.way(near.bodies.position)
+            freely += np.einsum("cij,cj->ci", self.frame, self.cell.free * way)
         if contacts.drift is not None:
             freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
         self._attracted: Floats | float = 0.0  #: mass-scaled momenta of the attraction
