@@ -109,7 +109,7 @@ class Flush(NamedTuple):
     name: Ints  #: (2, POINTS)
     flat: Floats  #: (2, POINTS, 2) the points across the normal
     slope: Floats  #: (2, 3) height and gradients of the plane or line through them
-    count: Ints  #: (2,) of the points
+    many: Ints  #: (2,) numbers of the points
     sense: Floats  #: (2,) in which they turn
     bend: Floats  #: (2,) the radius across it where it is a line
 
@@ -330,7 +330,7 @@ def _laid(shape, side, apart, frame, flush):
     point, name, flat, slope = flush.point[side], flush.name[side], flush.flat[side], flush.slope[side]
     x, y, z = _inward(shape.turn, (sign * n[0], sign * n[1], sign * n[2]))
     count, bend = _face(shape, x, y, z, point, name)
-    flush.count[side] = count
+    flush.many[side] = count
     if count < 2:
         return count
     middle = np.zeros(3)

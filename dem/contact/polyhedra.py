@@ -143,7 +143,7 @@ class Found(NamedTuple):
 class Edges(NamedTuple):
     """A polyhedron in the world by its edges, within loops."""
 
-    count: Ints  #: (3,) vertices, faces, edges
+    counts: Ints  #: (3,) of vertices, faces, edges
     points: Floats  #: (v, 3) its vertices
     normals: Floats  #: (f, 3)
     edge: Ints  #: (e, 2)
