@@ -154,15 +154,21 @@ class Stepper:
         settings = self.settings
         with log.phase("solve"):
             limits = rest.limits_of(settings.limits, world, system)
-            result = self._by(problem, guess, limits)
+            result = self._by(problem, guess, limits, self.newton)
             rest.account(world, limits, result)
-            result = rest.with_islands(world, system, problem, guess, limits, self._by, result)
+            result = rest.with_islands(world, system, problem, guess, limits, self._by_itself, result)
         return result if before is None else result.after(before)
 
-    def _by(self, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits) -> ccp.Result:
+    def _by(
+        self, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits, newton: ccp.Newton | None
+    ) -> ccp.Result:
         """What the method of the settings makes of a problem."""
         settings = self.settings
-        return ccp.solve(problem, guess, settings.solver, limits, settings.options, self.newton, settings.law)
+        return ccp.solve(problem, guess, settings.solver, limits, settings.options, newton, settings.law)
+
+    def _by_itself(self, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits) -> ccp.Result:
+        """The same of a part of the problem of a step."""
+        return self._by(problem, guess, limits, None if self.newton is None else self.newton.of_parts)
 
     def _missed(
         self, world: World, system: ContactSystem, velocity: Array, turned: int
