@@ -22,8 +22,9 @@ from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, half_thickness
 from dem.compiled import inlined, loop
 from dem.contact.ahead import Forms, Moving, Poses, Touching, after_turn, ahead_by, guest_is_second, spun, vector_of
-from dem.contact.narrow import DISTINCT, Manifold, Planes
-from dem.contact.polyhedra import CLOSE, ROUND, SNAP, Found, Hulls, Simplex, nearer
+from dem.contact.narrow import DISTINCT, Found, Manifold, Planes
+from dem.contact.polyhedra import Hulls
+from dem.contact.simplex import CLOSE, ROUND, SNAP, nearer, no_simplex
 from dem.contact.spheres import frame_of
 from dem.geometry.vectors import dot, plus
 from dem.shapes import CONVEX_SHAPES
@@ -474,8 +475,7 @@ def _pairs(first, form, second, other_form, vertices, faces, delta, progress, co
     done and contacts found."""
     (center, _, _, thick), (other_center, _, _, other_thick), (done, found) = first, second, progress
     rounding, other_rounding, (pair, feature, out) = form[3], other_form[3], contacts
-    points, frame = np.empty((64, 2, 3)), np.empty((3, 3))
-    simplex = Simplex(np.empty((4, 3)), np.empty((4, 2), np.int64), np.empty(4), np.empty(6))
+    points, frame, simplex = np.empty((64, 2, 3)), np.empty((3, 3)), no_simplex()
     flush = Flush(
         np.empty((2, POINTS, 3)), np.empty((2, POINTS), np.int64), np.empty((2, POINTS, 2)), np.zeros((2, 3)),
         np.empty(2, np.int64), np.empty(2), np.empty(2),

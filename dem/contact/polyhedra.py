@@ -22,7 +22,8 @@ import numpy as np
 
 from dem.arrays import Floats, Ints
 from dem.compiled import inlined, loop
-from dem.contact.narrow import CORNERS, Manifold, Planes, Spheres, Touch
+from dem.contact.narrow import CORNERS, Found, Manifold, Planes, Spheres
+from dem.contact.simplex import CLOSE, ROUND, SNAP, nearer, no_simplex
 from dem.geometry.vectors import dot
 from dem.shapes.forms import Form
 from dem.shapes.polyhedra import Faces, Solid, hull
@@ -31,19 +32,9 @@ from dem.shapes.polyhedra import Faces, Solid, hull
 #: not, in the closest points alone.
 FLUSH = 0.1
 
-#: Corners and edges that are closer to each other across the normal than this share of the lesser half thickness of the
-#: two count as one on top of the other.
-SNAP = 1e-3
-
 #: Lengths that differ by less than this share of the lesser half thickness are equal: what is chosen among equals does
 #: not depend on rounding.
 TIE = 1e-9
-
-#: Radius to which edges and corners that meet count as rounded, as a share of the lesser half thickness.
-ROUND = 0.01
-
-#: Two points that are closer than this share of the lesser half thickness give no direction.
-CLOSE = 1e-7
 
 #: Edges whose angle has a sine below this are parallel and have no normal in common.
 PARALLEL = 1e-5
@@ -117,29 +108,6 @@ class Polyhedra(NamedTuple):
         return center, turn, scale, self.hull
 
 
-class Found(NamedTuple):
-    """Room for contacts, which loops fill in."""
-
-    pair: Ints  #: (room,)
-    feature: Ints  #: (room,)
-    out: Floats  #: (room, 7) points, normals and gaps
-
-    @classmethod
-    def of(cls, room: int) -> Found:
-        """Room for so many."""
-        return cls(np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7)))
-
-    def doubled(self) -> Found:
-        """The same with as much room again."""
-        return Found(*(np.concatenate([column, np.empty_like(column)]) for column in self))  # type: ignore[arg-type]
-
-    def manifold(self, found: int) -> Manifold:
-        """The contacts that are filled in."""
-        columns = self.out[:found, :3], self.out[:found, 3:6], self.out[:found, 6]
-        touch = Touch(*(np.ascontiguousarray(column) for column in columns))
-        return Manifold(self.pair[:found], self.feature[:found], touch)
-
-
 class Edges(NamedTuple):
     """A polyhedron in the world by its edges, within loops."""
 
@@ -165,15 +133,6 @@ class Polygon(NamedTuple):
     flat: Floats  #: (s, 3) these, the height last
     beyond: Floats  #: (s, s) how far they are beyond the lines of the other polygon
     plane: Floats  #: (3,) slopes, and height at the origin
-
-
-class Simplex(NamedTuple):
-    """Points of the difference of two shapes, within loops, and the point of their hull nearest to the origin."""
-
-    point: Floats  #: (4, 3)
-    ends: Ints  #: (4, 2) the rows of the vertices of both shapes
-    share: Floats  #: (4,) of the points in the nearest one
-    parts: Floats  #: (6,) room for shares that are compared
 
 
 def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> Manifold:
@@ -234,11 +193,6 @@ def _planes(faces, body, plane, delta, contacts):
                 if found == len(out):
                     return found
     return found
-
-
-@loop
-def _simplex():
-    return Simplex(np.empty((4, 3)), np.empty((4, 2), np.int64), np.empty(4), np.empty(6))
 
 
 @loop
@@ -498,34 +452,6 @@ def _overlaid(face, other, frame, thick, most, room, found):
 
 
 @loop
-def _on_triangle(a, b, c, share):
-    """Fill in the shares of the corners of a triangle in its point nearest to the origin (Ericson 2005, "Real-time
-    collision detection", 5.1.5); its squared distance."""
-    aa, bb, cc, ab, ac, bc = dot(a, a), dot(b, b), dot(c, c), dot(a, b), dot(a, c), dot(b, c)
-    d1, d2, d3, d4, d5, d6 = aa - ab, aa - ac, ab - bb, ab - bc, ac - bc, ac - cc
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    if d1 <= 0.0 and d2 <= 0.0:
-        v, w = 0.0, 0.0
-    elif d3 >= 0.0 and d4 <= d3:
-        v, w = 1.0, 0.0
-    elif d6 >= 0.0 and d5 <= d6:
-        v, w = 0.0, 1.0
-    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        v, w = d1 / (d1 - d3), 0.0
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        v, w = 0.0, d2 / (d2 - d6)
-    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        v = 1.0 - w
-    else:
-        v, w = vb / (va + vb + vc), vc / (va + vb + vc)
-    u = 1.0 - v - w
-    share[0], share[1], share[2] = u, v, w
-    x, y, z = u * a[0] + v * b[0] + w * c[0], u * a[1] + v * b[1] + w * c[1], u * a[2] + v * b[2] + w * c[2]
-    return x * x + y * y + z * z
-
-
-@loop
 def _distance(p, q, apart, reach, size, simplex):
     """How many points of the difference of two polyhedra that do not overlap span what is nearest to the origin, and
     the distance, or that it is more than the reach: zero and inf. Fills in the points, the rows of the vertices of
@@ -553,42 +479,6 @@ def _distance(p, q, apart, reach, size, simplex):
             break
         count, square, x, y, z = many, better, u, v, w
     return count, np.sqrt(square)
-
-
-@inlined
-def nearer(count, square, simplex):
-    """Make of a simplex of so many points, and of the point that follows them, the part that is nearest to the origin,
-    if it is nearer than `square`: how many points it has, the square of its distance, and its place. The ends go with
-    the points; their shares are filled in."""
-    point, ends, share, parts = simplex
-    first, second, better = 0, 0, np.inf  # the new simplex: `first`, `second` and the last of the points
-    if count == 0:
-        better = dot(point[0], point[0])
-        parts[0], parts[1], parts[2] = 0.0, 0.0, 1.0
-    elif count == 1:
-        a, b = dot(point[0], point[0]), dot(point[0], point[1])
-        t = min(max((a - b) / (a - 2.0 * b + dot(point[1], point[1])), 0.0), 1.0)
-        parts[0], parts[1], parts[2], better = 1.0 - t, 0.0, t, 0.0
-        for n in range(3):
-            better += ((1.0 - t) * point[0, n] + t * point[1, n]) ** 2
-    else:
-        for one in range(count - 1):
-            for two in range(one + 1, count):
-                found = _on_triangle(point[one], point[two], point[count], parts[3:])
-                if found < better:
-                    better, first, second = found, one, two
-                    parts[0], parts[1], parts[2] = parts[3], parts[4], parts[5]
-    x, y, z, last = 0.0, 0.0, 0.0, count
-    if better < square:
-        count = 0
-        for n in range(3):
-            k = first if n == 0 else second if n == 1 else last
-            if parts[n] > 0.0:
-                share[count], ends[count, 0], ends[count, 1] = parts[n], ends[k, 0], ends[k, 1]
-                point[count, 0], point[count, 1], point[count, 2] = point[k, 0], point[k, 1], point[k, 2]
-                x, y, z = x + parts[n] * point[k, 0], y + parts[n] * point[k, 1], z + parts[n] * point[k, 2]
-                count += 1
-    return count, better, x, y, z
 
 
 @loop
@@ -725,7 +615,7 @@ def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
     core, contacts_of_faces = np.empty((2, most_v, 3)), (np.empty((4 * s, 4)), np.empty(4 * s, np.int64))
     slopes, axis, frame, place = np.empty((2, most_e, most_f)), np.empty(3), np.empty((3, 3)), np.empty((2, 3))
     polygons = np.empty((2, s, 3)), np.empty((2, s, 3)), np.empty((2, 3)), np.empty((2, s, s))
-    (_, line, _, _), (spots, code), simplex, core_place = polygons, contacts_of_faces, _simplex(), np.empty((2, 3))
+    (_, line, _, _), (spots, code), simplex, core_place = polygons, contacts_of_faces, no_simplex(), np.empty((2, 3))
     p, q, p_normal, q_normal, p_level, q_level = points[0], points[1], normals[0], normals[1], level[0], level[1]
     for m in range(done, len(hull)):
         if found + most > len(out):
@@ -916,7 +806,7 @@ def _spheres(spheres, faces, corner, body, delta, contacts):
     (ball, radius), (center, turn, scale, hull), (pair, feature, out) = spheres, body, contacts
     (_, count, vertex, normal) = faces
     points, normals, level = np.empty(vertex.shape[1:]), np.empty(normal.shape[1:]), np.empty(normal.shape[1])
-    simplex, middle, found = _simplex(), np.zeros((1, 3)), 0
+    simplex, middle, found = no_simplex(), np.zeros((1, 3)), 0
     point, share = simplex.point, simplex.share
     for m in range(len(hull)):
         reach = delta[m] + radius[m]

@@ -15,7 +15,7 @@ import numpy as np
 from dem import checks, quaternion, shapes
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import SPHERE, Bodies, concatenate, enclosing_radius, none
-from dem.measures import Block, Cylinder
+from dem.geometry.region import Block, Cylinder
 from dem.motion import Timed
 from dem.parts.named import Named
 from dem.shapes import Box, Capsule

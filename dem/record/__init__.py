@@ -19,6 +19,7 @@ from dem.compiled import loop
 from dem.exchange import reduced, told
 from dem.experiment import Experiment
 from dem.motion import Held
+from dem.record.energies import energy
 from dem.start import stiffness
 from dem.step import Step
 from dem.step.servo import cell_stress
@@ -93,35 +94,6 @@ CREATED, SUDDEN = 0.1, 10.0
 SLOW = 0.1  #: a body is at rest below this part of the speed that a step of free fall gives
 CREEP = 1e-6  #: or below this part of its radius in a step
 SUNK = 1e-3  #: a rise of the energy is none if bodies would get it by sinking for this part of their radii
-
-
-def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
-    """Kinetic and potential energy [J] of the bodies of a table that forces can move; the potential energy is zero at
-    the origin."""
-    kinetic, moment = energies(table.position, table.quaternion, table.velocity, table.mass, table.inertia)
-    return kinetic, float(-(moment @ gravity))
-
-
-@loop
-def energies(position: Floats, turn: Floats, velocity: Floats, mass: Floats, inertia: Floats) -> tuple[float, Floats]:
-    """The kinetic energy [J] of n bodies with principal moments (n, 3), and the sum of mass times position (3,)
-    [kg m]. An infinite mass or moment does not move."""
-    kinetic, moment = 0.0, np.zeros(3)
-    for n in range(len(mass)):
-        if np.isfinite(mass[n]):
-            for k in range(3):
-                kinetic += 0.5 * mass[n] * velocity[n, k] ** 2
-                moment[k] += mass[n] * position[n, k]
-            w, x, y, z = turn[n, 0], -turn[n, 1], -turn[n, 2], -turn[n, 3]
-            a, b, c = velocity[n, 3], velocity[n, 4], velocity[n, 5]
-            p, q, r = y * c - z * b, z * a - x * c, x * b - y * a  # to the frame of the body
-            spin = (
-                a + 2.0 * (w * p + y * r - z * q), b + 2.0 * (w * q + z * p - x * r), c + 2.0 * (w * r + x * q - y * p)
-            )  # fmt: skip
-            for k in range(3):
-                if np.isfinite(inertia[n, k]):
-                    kinetic += 0.5 * inertia[n, k] * spin[k] ** 2
-    return kinetic, moment
 
 
 def energy_balance(step: Step) -> dict[str, float]:

@@ -17,7 +17,7 @@ from dem.model.neighbourhood import Neighbourhood, touched
 from dem.model.partition import redistribute
 from dem.model.world import World
 from dem.parts.sources import MOST_IDS, Source, bounds, reach
-from dem.record import energy
+from dem.record.energies import energy
 from dem.together import SceneError
 
 PART = 256  #: grains that are placed at once

@@ -18,7 +18,7 @@ from dem import quaternion
 from dem.arrays import Floats
 from dem.bodies import CLUMP
 from dem.compiled import loop
-from dem.shapes import Clump, principal
+from dem.shapes import Clump
 from dem.shapes.forms import Form
 
 CELLS = 1000
@@ -50,7 +50,7 @@ def form(shape: Clump) -> ClumpForm:
     center, radius = np.array(shape.centres), np.array(shape.radii)
     middle = center.mean(axis=0)
     volume, place, tensor = union(center - middle, radius)
-    moments, turn = principal(tensor)
+    moments, turn = quaternion.principal(tensor)
     place = place + middle
     own = quaternion.rotate(quaternion.conjugate(turn), center - place)
     return ClumpForm(volume, moments, place, turn, own, radius)

@@ -23,8 +23,8 @@ from functools import partial
 import numpy as np
 
 from dem.exchange import told
+from pctt.arrays import Array
 from pctt.ccp import gathered
-from pctt.ccp.cones import Array
 from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic

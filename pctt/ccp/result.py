@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, Optional
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.problem import Errors
 from pctt.options import FRACTION, number, option
 

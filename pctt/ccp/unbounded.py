@@ -13,7 +13,7 @@ import numpy as np
 from dem.compiled import loop
 from dem.contact_map import find_halo
 from dem.exchange import told
-from pctt.ccp.cones import TINY, Array, tangential
+from pctt.arrays import TINY, Array, tangential
 from pctt.ccp.delassus import ColumnMap, sums_of
 from pctt.ccp.problem import ConeProblem
 

@@ -10,8 +10,8 @@ from mpi4py import MPI
 
 from dem.compiled import tell_first_compilation
 from pctt import ccp, log
+from pctt.arrays import Array
 from pctt.ccp import fclib
-from pctt.ccp.cones import Array
 from pctt.ccp.fclib import FileFormatError, Stored
 from pctt.disk import FileError, on_first, write_text
 from pctt.folder import dumps

@@ -25,7 +25,8 @@ from dem.step.system import ContactSystem, contact_frames
 from dem.together import SceneError
 from dem.unconstrained import unconstrained
 from pctt import ccp, log
-from pctt.ccp.cones import Array, Cones
+from pctt.arrays import Array
+from pctt.ccp.cones import Cones
 from pctt.options import OptionError
 from pctt.run import rest
 from pctt.run.dump import Dump

@@ -26,12 +26,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dem.compiled import inlined, loop
+from pctt.arrays import TINY, Array
 
-Array = NDArray[np.float64]
-TINY = float(np.finfo(float).tiny)
 HELD = 1e12  # stiffness of what is held, over that of normal impulses: the block keeps its digits
 LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
 ROUND = 1e-14  # tangential part of a unit scaling point below which it has no direction

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.ccp.cones import TINY, Array
+from pctt.arrays import TINY, Array
 from pctt.ccp.cones.lorentz import HELD
 from pctt.ccp.problem import ConeProblem
 

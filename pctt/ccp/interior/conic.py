@@ -33,7 +33,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cones import TINY, Array, dot, lorentz, tangential
+from pctt.arrays import TINY, Array, dot, tangential
+from pctt.ccp.cones import lorentz
 from pctt.ccp.cones.friction import step_to_zero
 from pctt.ccp.cones.lorentz import ArrowInverse, NesterovTodd
 from pctt.ccp.interior import useful_part

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.cones.friction import step_to_zero
 from pctt.ccp.interior import INDEFINITE, hold, is_indefinite, velocity
 from pctt.ccp.newton import Newton

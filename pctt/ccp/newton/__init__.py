@@ -21,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.exchange import on_any
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.by_elimination import ByElimination, has_few, matrix_of, order_of
 from pctt.ccp.newton.by_factors import ByFactors

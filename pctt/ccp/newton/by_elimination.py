@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.delassus import GivenMatrix, all_blocks
 from pctt.ccp.newton.by_ksp import ByKSP
 from pctt.ccp.newton.defaults import GIVEN

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from mpi4py import MPI
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.newton.defaults import DEFAULTS
 from pctt.ccp.newton.factor import Room, easy_iterations
 from pctt.ccp.newton.forms import System

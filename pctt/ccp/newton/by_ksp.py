@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from mpi4py import MPI
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.defaults import INCOMPLETE, Options
 from pctt.ccp.newton.factor import Room

@@ -25,9 +25,9 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 
 from dem.contact_map.loops import local_product, pack
+from pctt.arrays import Array
 from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.body_matrix import BodyOperator, inverse_blocks
-from pctt.ccp.cones import Array
 from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.defaults import DIRECT, MULTIFRONTAL, Options
 from pctt.ccp.newton.elimination import Order

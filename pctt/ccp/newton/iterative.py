@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.ccp.cones import TINY, Array
+from pctt.arrays import TINY, Array
 from pctt.ccp.newton.defaults import UNSYMMETRIC, Options
 from pctt.ccp.newton.factor import Factor, Room
 from pctt.ccp.newton.forms import System

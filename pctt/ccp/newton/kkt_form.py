@@ -8,8 +8,8 @@ import numpy as np
 import scipy.sparse as sp
 from petsc4py import PETSc
 
+from pctt.arrays import Array
 from pctt.blocks import new_matrix, set_diagonal_blocks, symmetric_shell
-from pctt.ccp.cones import Array
 from pctt.ccp.delassus import rows_in_blocks
 from pctt.ccp.newton.forms import ContactForm
 from pctt.ccp.newton.kkt import KKT
