@@ -14,14 +14,16 @@ import typing
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from dem import checks
 from dem.arrays import Floats
 from dem.options import option
 from dem.scene import Scene
-from dem.step import Step
 from dem.together import SCENE_FILE, in_words
+
+if TYPE_CHECKING:
+    from dem.step import Step
 
 __all__ = ["Experiment", "Given", "SceneFileError", "from_file", "option"]
 

@@ -5,11 +5,15 @@ Every function but `integrate` works on stacks: quaternions have shape (..., 4),
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dem.arrays import Floats
 from dem.compiled import loop
+
+if TYPE_CHECKING:
+    from dem.arrays import Floats
 
 #: scipy takes and gives (x, y, z, w); its `scalar_first` came with 1.14.
 _TO_SCIPY, _FROM_SCIPY = [1, 2, 3, 0], [3, 0, 1, 2]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,8 +21,10 @@ from dem.model.neighbourhood import Neighbourhood, refreshed
 from dem.model.world import World
 from dem.parts.cell import Cell
 from dem.quaternion import cross, length
-from dem.unconstrained import UnconstrainedMotion
 from dem.unconstrained.drives import free_directions, free_turns
+
+if TYPE_CHECKING:
+    from dem.unconstrained import UnconstrainedMotion
 
 #: Margin of a grain over the way that it goes in a step without contact forces: those that push it on often add a part.
 FURTHER = 1.25

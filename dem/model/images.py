@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,10 +19,12 @@ from dem import bodies, quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.exchange import greatest, on_any
 from dem.model.neighbourhood import Neighbourhood, chunk_boxes, touched
-from dem.model.world import World
 from dem.parts.cell import Cell
 from dem.shapes import Plane, placed
 from dem.together import SceneError
+
+if TYPE_CHECKING:
+    from dem.model.world import World
 
 
 def put_back(world: World) -> None:

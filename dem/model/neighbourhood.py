@@ -6,7 +6,7 @@ A contact belongs to the rank of the lower global body index: ghosts only travel
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,9 @@ from dem.arrays import Floats, Ints
 from dem.bodies import Bodies
 from dem.contact_map.halo import Halo
 from dem.exchange import exchange
-from dem.model.world import World
+
+if TYPE_CHECKING:
+    from dem.model.world import World
 
 
 @dataclass(frozen=True)

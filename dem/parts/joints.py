@@ -8,16 +8,18 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from dem import checks, quaternion
 from dem.arrays import Floats, Ints
 from dem.motion import Driven
-from dem.parts.cell import Cell
 from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Condition, Constraint, End, Geometry, Place
 from dem.parts.named import Pressing
+
+if TYPE_CHECKING:
+    from dem.parts.cell import Cell
 
 
 def axes_of(frame: Floats) -> Floats:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -21,10 +21,12 @@ from dem.experiment import Experiment
 from dem.motion import Held
 from dem.record.energies import energy
 from dem.start import stiffness
-from dem.step import Step
 from dem.step.servo import cell_stress
 from dem.together import SceneError, digest, together
 from dem.unconstrained.constraints import slots
+
+if TYPE_CHECKING:
+    from dem.step import Step
 
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:

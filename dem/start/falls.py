@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,10 @@ from dem import bodies, quaternion, shapes
 from dem.arrays import Floats
 from dem.bodies import BOX, CAPSULE, MESH, PLANE, Bodies
 from dem.motion import Dynamic
-from dem.scene import LargeBody, Scene
 from dem.shapes import Plane, Shape, placed
+
+if TYPE_CHECKING:
+    from dem.scene import LargeBody, Scene
 
 STEEP = 0.1  #: cosine between the way and the normal of a surface below which it is a wall
 DENSE = 0.64  #: solid fraction of a settled bed

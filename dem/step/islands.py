@@ -3,6 +3,8 @@ another, so each may have an accuracy of its own."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from dem import bodies
@@ -11,8 +13,10 @@ from dem.compiled import loop
 from dem.contact_map.halo import Halo
 from dem.exchange import exchange, on_any
 from dem.model.world import World
-from dem.step.system import ContactSystem
 from dem.unconstrained.constraints import slots
+
+if TYPE_CHECKING:
+    from dem.step.system import ContactSystem
 
 ROUND = 3  #: contacts that a single sphere may have at rest
 

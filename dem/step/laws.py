@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats
 from dem.bodies import COMPOUND
-from dem.contact import Contacts
 from dem.model.world import World
 from dem.parts.laws import Met
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
 
 
 def met(world: World, contacts: Contacts, dt: float, slip: Floats) -> Met:

@@ -7,14 +7,16 @@ the same for moments as for forces.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from dem.arrays import Floats
-from dem.contact import Contacts
 from dem.contact_map import ContactMap, TurningMap
 from dem.model.world import World
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
 
 
 class Resistance(NamedTuple):

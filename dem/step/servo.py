@@ -19,13 +19,17 @@ part KEPT of the last E, up to the rates that are given; without these it is zer
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats
-from dem.contact import Contacts
 from dem.contact_map.mass import CellStep
 from dem.model.world import World
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
 
 CLOSING = 0.01  #: rate times d sqrt(rho / P): a loose cell closes in quasistatic motion
 LEADING = 5.0

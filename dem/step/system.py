@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -25,7 +26,6 @@ from dem import bodies
 from dem.arrays import Floats, Keys, places
 from dem.bodies import Bodies
 from dem.compiled import loop
-from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
 from dem.contact_map.loops import closing, scale
 from dem.contact_map.mass import CellMass, ConstrainedMass
@@ -41,6 +41,9 @@ from dem.step.surface import surface_velocities
 from dem.unconstrained import UnconstrainedMotion, free_velocities, large_velocity
 from dem.unconstrained.constraints import coupling_of, coupling_refound, slots
 from dem.unconstrained.drives import Drives, free_directions
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
 
 #: Bodies that contacts turned by more radians in the last step were struck: those impulses do not come again.
 STRUCK = 0.05

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pctt.arrays import Array
-from pctt.ccp.problem import Errors
 from pctt.options import FRACTION, number, option
+
+if TYPE_CHECKING:
+    from pctt.ccp.problem import Errors
 
 if TYPE_CHECKING:
     from pctt.ccp.accuracy import Accuracy

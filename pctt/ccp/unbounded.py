@@ -7,6 +7,7 @@ held by friction between them. The natural residual does not show it: it falls l
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +16,9 @@ from dem.contact_map import find_halo
 from dem.exchange import told
 from pctt.arrays import TINY, Array, tangential
 from pctt.ccp.delassus import ColumnMap, sums_of
-from pctt.ccp.problem import ConeProblem
+
+if TYPE_CHECKING:
+    from pctt.ccp.problem import ConeProblem
 
 ROUNDED = 1e-4  # of the greatest eigenvalue of N: below it a negative one is of rounded digits, -1e-5 of five
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -29,8 +29,10 @@ from pctt.arrays import Array
 from pctt.ccp.cones import Cones
 from pctt.options import OptionError
 from pctt.run import rest
-from pctt.run.dump import Dump
-from pctt.run.settings import Settings
+
+if TYPE_CHECKING:
+    from pctt.run.dump import Dump
+    from pctt.run.settings import Settings
 
 TRIES = 3  #: linearisations of turned contacts in a step, and of limits and motors that contacts have shown
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from typing import Union
+from typing import TYPE_CHECKING, Union
 
 import numpy as np
 import scipy.sparse as sp
@@ -34,7 +34,9 @@ from pctt.ccp.newton.elimination import Order
 from pctt.ccp.newton.kkt import KKT
 from pctt.ccp.newton.krylov import Source
 from pctt.ccp.newton.multifrontal import Dissection, MultifrontalFactors
-from pctt.ccp.problem import ConeProblem
+
+if TYPE_CHECKING:
+    from pctt.ccp.problem import ConeProblem
 
 
 class Form:
