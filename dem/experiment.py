@@ -25,7 +25,7 @@ from dem.together import SCENE_FILE, in_words
 if TYPE_CHECKING:
     from dem.step import Step
 
-__all__ = ["Experiment", "Given", "SceneFileError", "from_file", "option"]
+__all__ = ["Experiment", "SceneExperiment", "SceneFileError", "from_file", "option"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Experiment:
         return {}
 
 
-class Given(Experiment):
+class SceneExperiment(Experiment):
     """A scene that is built already."""
 
     def __init__(self, scene: Scene):

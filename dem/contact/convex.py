@@ -22,7 +22,7 @@ from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, half_thickness
 from dem.compiled import inlined, loop
 from dem.contact.ahead import Forms, Moving, Poses, Touching, after_turn, ahead_by, guest_is_second, spun, vector_of
-from dem.contact.narrow import DISTINCT, Found, Manifold, Planes
+from dem.contact.narrow import DISTINCT, ContactBuffer, Manifold, Planes
 from dem.contact.polyhedra import Hulls
 from dem.contact.simplex import CLOSE, ROUND, SNAP, nearer, no_simplex
 from dem.contact.spheres import frame_of
@@ -135,7 +135,7 @@ def solids(kind: Ints, center: Floats, turn: Floats, size: Floats, hulls: Hulls,
 def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) -> Manifold:
     """Contacts of gap at most `delta` (m,) [m], all with the same normal."""
     done, found, room = 0, 0, 4 * len(delta) + POINTS
-    given, contacts = (*first.tables(), *second.tables(), *_tables(hulls), delta), Found.of(room)
+    given, contacts = (*first.tables(), *second.tables(), *_tables(hulls), delta), ContactBuffer.of(room)
     while True:
         done, found = _pairs(*given, (done, found), contacts[:])
         if done == len(delta):
@@ -145,7 +145,7 @@ def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) ->
 
 def solids_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> Manifold:
     """What of the body lies flush along the plane: the points of a face or a side, and the support."""
-    contacts, (outward, origin) = Found.of(len(delta) * POINTS), map(np.ascontiguousarray, plane)
+    contacts, (outward, origin) = ContactBuffer.of(len(delta) * POINTS), map(np.ascontiguousarray, plane)
     given = *body.tables(), *_tables(hulls), (outward, origin), delta
     return contacts.manifold(_planes(*given, contacts[:]))
 

@@ -59,7 +59,7 @@ class Lists:
 
     def hold(self, world: World, margin: Floats) -> bool:
         """Whether the lists of this rank have all pairs of these margins (grains,)."""
-        margin = margin + world.cell.gone_since(self.cell)
+        margin = margin + world.cell.image_travel(self.cell)
         same = all(map(is_, self.constant, _constant(world)))
         return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
 

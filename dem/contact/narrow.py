@@ -78,7 +78,7 @@ class Manifold(NamedTuple):
     touch: Touch  #: (k, ...)
 
 
-class Found(NamedTuple):
+class ContactBuffer(NamedTuple):
     """Room for contacts, which loops fill in."""
 
     pair: Ints  #: (room,)
@@ -86,13 +86,13 @@ class Found(NamedTuple):
     out: Floats  #: (room, 7) points, normals and gaps
 
     @classmethod
-    def of(cls, room: int) -> Found:
+    def of(cls, room: int) -> ContactBuffer:
         """Room for so many."""
         return cls(np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7)))
 
-    def doubled(self) -> Found:
+    def doubled(self) -> ContactBuffer:
         """The same with as much room again."""
-        return Found(*(np.concatenate([column, np.empty_like(column)]) for column in self))  # type: ignore[arg-type]
+        return ContactBuffer(*(np.concatenate([column, np.empty_like(column)]) for column in self))  # type: ignore[arg-type]
 
     def manifold(self, found: int) -> Manifold:
         """The contacts that are filled in."""

@@ -80,7 +80,7 @@ class Contacts:
         """The gaps (nc,) to which the normal velocities of a step times dt are added [m]."""
         return self.gap if self.linear is None else self.linear
 
-    def way(self, position: Floats) -> Floats:
+    def branch(self, position: Floats) -> Floats:
         """From the centre of body a to that of body b, or of its image (nc, 3), at these positions (rows, 3) [m]."""
         way = position[self.b] - position[self.a]
         return way if self.moved is None else way + self.moved
@@ -90,7 +90,7 @@ class Contacts:
         its shear and as it changes its size; None: nothing [m/s]."""
         if not cell.deforms:
             return self.drift
-        affine: Floats = cell.rate * self.way(position)
+        affine: Floats = cell.rate * self.branch(position)
         return affine if self.drift is None else self.drift + affine
 
     def take(self, rows: np.ndarray) -> Contacts:
@@ -143,7 +143,7 @@ def _margins(
     dt, velocity = (0.0, world.grains.velocity) if free is None else (free.dt, free.grains)
     if shifts is None:
         shifts = (np.zeros(world.large.velocity.shape) if free is None else dt * free.drives.free)[None]
-    way = ways(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
+    way = greatest_travel(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
     way = way + world.cell.margin(dt, world.grains)
     return np.maximum(np.maximum(delta / 2, way), least), way, shifts
 
@@ -272,7 +272,7 @@ def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Keys
     return np.lexsort((key, owner, foreign[a] | foreign[b]))
 
 
-def goes_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
+def exceeds_margin(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
     """Whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as in one
     of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
     free = bodies.is_dynamic(world.large)
@@ -287,7 +287,7 @@ def goes_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool
 
 
 @loop
-def ways(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
+def greatest_travel(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
     """About how far (n,) a point of each grain goes in dt [s], at most two of its radii [m]. For spheres it is the
     centre's way, as turning does not move their surface. NaN where the velocity is not finite."""
     out = np.empty(len(shape))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from dem.model.world import World
 
 
-def put_back(world: World) -> None:
+def wrap(world: World) -> None:
     """Put all grains back into the cell if one is too far outside; collective. SceneError for large bodies that the
     cell does not allow now."""
     cell = world.cell
@@ -142,7 +142,7 @@ def images(world: World, near: Neighbourhood) -> Images:
     large = _boxes(world)
     steps, across = cell.images()
     found = [np.zeros(0, np.int64)]  # of the bodies themselves
-    for way in cell.ways[1:]:
+    for way in cell.image_vectors[1:]:
         rows = touched(position + way, radius, own[None])[0]
         if len(large):
             of_large = touched(position[: near.grains] + way, radius[: near.grains], large[None])[0]

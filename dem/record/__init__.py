@@ -16,7 +16,7 @@ from dem import bodies
 from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
-from dem.exchange import reduced, told
+from dem.exchange import broadcast, reduced
 from dem.experiment import Experiment
 from dem.motion import Held
 from dem.record.energies import energy
@@ -77,11 +77,11 @@ def cell(step: Step) -> dict[str, float]:
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
     place = step.world.cell.wrapped(step.world.grains.position)
-    return step.total(outside_of(place, np.asarray(low, float), np.asarray(high, float)))
+    return step.total(count_outside(place, np.asarray(low, float), np.asarray(high, float)))
 
 
 @loop
-def outside_of(place: Floats, low: Floats, high: Floats) -> int:
+def count_outside(place: Floats, low: Floats, high: Floats) -> int:
     """How many places (n, 3) are outside the box from `low` to `high` (3,)."""
     lost = 0
     for n in range(len(place)):
@@ -172,7 +172,7 @@ def energy_balance(step: Step) -> dict[str, float]:
         "impact_loss [J]": 0.0 - whole["normal"] - held,
         **({} if system.attraction is None else {"work_of_cohesion [J]": whole["attracted"]}),
         "time_stepping [J]": made,
-        "energy_jump [J]": told(comm, rise if jumps else 0.0),  # what follows from it must not differ between ranks
+        "energy_jump [J]": broadcast(comm, rise if jumps else 0.0),  # what follows from it is the same on all ranks
     }
 
 

@@ -39,7 +39,7 @@ KEPT = 0.9
 def cell_stress(world: World, contacts: Contacts, force: Floats) -> Floats:
     """Stress (3, 3) of a cell with three periods after a step, of the forces (nc, 3) [N] of its contacts (Love, Weber)
     and of the motion of the grains beside that of the cell, positive in compression [Pa]; collective."""
-    borne = world.comm.allreduce(force.T @ contacts.way(contacts.near.bodies.position))
+    borne = world.comm.allreduce(force.T @ contacts.branch(contacts.near.bodies.position))
     stress: Floats = borne / world.cell.volume + _motion(world)[0]
     return stress
 
@@ -64,7 +64,7 @@ def cell_of(world: World, contacts: Contacts, frame: Floats, dt: float) -> CellS
     cell = world.cell
     if not cell.deforms:
         return None
-    given = cell.given_at(world.time, dt)
+    given = cell.given_rates(world.time, dt)
     follows = np.isnan(given) & ~np.isnan(cell.stress)
     asked = np.where(follows, cell.stress, 0.0)
     stress, time = _motion(world)
@@ -74,5 +74,5 @@ def cell_of(world: World, contacts: Contacts, frame: Floats, dt: float) -> CellS
     root = np.where(follows, 1.0 / np.sqrt(eta * dt * cell.volume), 0.0)
     kept = np.clip(KEPT * cell.rate, -leads, leads)
     free = np.where(follows, kept + (np.diag(stress) - asked) / eta, np.nan_to_num(given))
-    way = contacts.way(contacts.near.bodies.position)
+    way = contacts.branch(contacts.near.bodies.position)
     return CellStep((frame * way[:, None]).reshape(-1, 9), root, free)

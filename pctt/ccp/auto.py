@@ -22,7 +22,7 @@ from functools import partial
 
 import numpy as np
 
-from dem.exchange import told
+from dem.exchange import broadcast
 from pctt.arrays import Array
 from pctt.ccp import gathered
 from pctt.ccp.coulomb import fixed_point
@@ -67,7 +67,7 @@ def solve(
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
     tried = Attempts(problem, limits, newton, coulomb)
     few, small = newton.has_elimination(problem), problem.size <= by_elimination.FEW
-    begun = min(limits.max_it, told(problem.comm, options.iterations(problem.size, limits.tol, coulomb, few)))
+    begun = min(limits.max_it, broadcast(problem.comm, options.iterations(problem.size, limits.tol, coulomb, few)))
     first = tried.apgd(guess, begun)
     if first.converged and first.residual > limits.aimed:
         tried.beyond(guess, few)

@@ -28,7 +28,7 @@ from math import inf, prod
 import numpy as np
 from scipy import fft
 
-from pctt.tt.conjugate import ConjugateGradients, Promise, at_least, race
+from pctt.tt.conjugate import ConjugateGradients, CostEstimate, at_least, race
 from pctt.tt.train import Array
 
 EPSILON = float(np.finfo(float).eps)
@@ -342,7 +342,7 @@ class Choice:
     """The preconditioner with which a solution costs least, and what trials on parts of the grid have shown."""
 
     kind: Kind
-    promise: Promise
+    cost_estimate: CostEstimate
 
 
 def parts(a: Differences, share: float) -> list[Differences]:
@@ -383,7 +383,7 @@ def choose(a: Differences) -> Choice | None:
     """
     if max(a.aperiodic) <= 1e-12:  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
-        return Choice(CIRCULANT, Promise(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
+        return Choice(CIRCULANT, CostEstimate(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
     first, *others = sorted((COSINE, CIRCULANT, SINE), key=lambda kind: a.distance(kind[0][0]))
     kinds, nearer = [first, NOTHING, *others, *MORE, *[BLOCK_DIAGONAL] * (a.block > 1)], _nearer([a])
     scores: dict[Kind, float] = {}
@@ -415,9 +415,9 @@ def choose(a: Differences) -> Choice | None:
         inverse = FastInverse(a, found)
         if not inverse.positive:
             return None
-        return Choice(found, Promise(inverse.each, UNTRIED, alone))
+        return Choice(found, CostEstimate(inverse.each, UNTRIED, alone))
     hard = max(trials, key=lambda trial: trial.costs[found])
-    return Choice(found, Promise(hard.runs[found].each, hard.runs[found].norms, alone, spent / prod(a.shape)))
+    return Choice(found, CostEstimate(hard.runs[found].each, hard.runs[found].norms, alone, spent / prod(a.shape)))
 
 
 def _nearer(pieces: Sequence[Differences]) -> float:
