@@ -5,11 +5,15 @@ Every public function but `integrate` works on stacks: quaternions have shape (.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dem.arrays import Floats
 from dem.compiled import loop
+
+if TYPE_CHECKING:
+    from dem.arrays import Floats
 
 #: scipy takes and gives (x, y, z, w); its `scalar_first` came with 1.14.
 _TO_SCIPY, _FROM_SCIPY = [1, 2, 3, 0], [3, 0, 1, 2]
@@ -115,3 +119,13 @@ def integrate(q: Floats, angular_velocity: Floats, dt: float) -> Floats:
         size = 1.0 / np.sqrt(e * e + f * f + g * g + h * h)
         out[n, 0], out[n, 1], out[n, 2], out[n, 3] = size * e, size * f, size * g, size * h
     return out
+
+
+def principal(tensor: Floats) -> tuple[Floats, Floats]:
+    """Principal moments (3,) and axes, as a quaternion (4,), of an inertia tensor (3, 3); where it is diagonal the axes
+    stay."""
+    moments, axes = np.diag(tensor).copy(), np.eye(3)
+    if np.abs(tensor - np.diag(moments)).max() > 1e-12 * moments.max():
+        moments, axes = np.linalg.eigh(tensor)
+        axes[:, 2] *= np.linalg.det(axes)  # right-handed
+    return moments, from_matrix(axes)

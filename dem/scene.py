@@ -26,8 +26,8 @@ from mpi4py import MPI
 from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints, Rule, frozen
 from dem.bodies import BOX, CAPSULE, COMPOUND, PLANE, SPHERE, Bodies
+from dem.geometry.region import Block, Cylinder
 from dem.geometry.survey import Survey, survey
-from dem.measures import Block, Cylinder
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
 from dem.parts import cell, contact_law
 from dem.parts.contact_law import ContactLaw
@@ -780,7 +780,7 @@ def _reframed(body: LargeBody, center: Floats, inner: Floats) -> LargeBody:
 def _centered(body: LargeBody, density: float) -> LargeBody:
     """The same body with its frame at the centre of mass along the principal axes, with mass and moments."""
     mass, center, tensor = shapes.mass_properties(body.shapes, density)
-    moments, turn = shapes.principal(tensor)
+    moments, turn = quaternion.principal(tensor)
     return replace(_reframed(body, center, turn), mass=mass, inertia=moments)
 
 

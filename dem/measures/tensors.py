@@ -8,9 +8,9 @@ from dem.arrays import Bools, Floats
 from dem.bodies import SPHERE
 from dem.checks import positive
 from dem.compiled import loop
+from dem.geometry.region import Block, Cylinder, Region
 from dem.measures.grains import bearing, branches, ends
 from dem.measures.images import images
-from dem.measures.region import Block, Cylinder, Region
 from dem.measures.sample import Sample, summed
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,8 +24,11 @@ from dem.parts.cell import Cell
 from dem.shapes import Plane, placed
 from dem.together import SceneError
 
+if TYPE_CHECKING:
+    from dem.model.world import World
 
-def put_back(world: World) -> None:
+
+def wrap(world: World) -> None:
     """Put all grains back into the cell if one is too far outside; collective. SceneError for large bodies that the
     cell does not allow now."""
     cell = world.cell
@@ -138,9 +142,10 @@ def images(world: World, near: Neighbourhood) -> Images:
     own = chunk_boxes(position[: near.grains], radius[: near.grains], 8)
     large = _boxes(world)
     steps, across = cell.images()
-    seen = seen_by(position, radius, cell.ways, own[None])[0]
+    seen = seen_by(position, radius, cell.image_vectors, own[None])[0]
     if len(large):
-        seen[:, : near.grains] |= seen_by(position[: near.grains], radius[: near.grains], cell.ways, large[None])[0]
+        of_grains = position[: near.grains], radius[: near.grains]
+        seen[:, : near.grains] |= seen_by(*of_grains, cell.image_vectors, large[None])[0]
     seen[0] = False  # the bodies themselves
     which, source = seen.nonzero()
     steps, across = steps[which], across[which]

@@ -6,7 +6,7 @@ A contact belongs to the rank of the lower global body index: ghosts only travel
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,9 @@ from dem.bodies import Bodies
 from dem.compiled import inlined, loop
 from dem.contact_map.halo import Halo
 from dem.exchange import exchange
-from dem.model.world import World
+
+if TYPE_CHECKING:
+    from dem.model.world import World
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
         )
     mine, large = world.slabs[comm.rank] + np.arange(len(grains)), world.slabs[-1] + np.arange(len(world.large))
     columns = dict(grains.columns(), margin=margin, index=mine)
-    rank, row = seen_by(grains.position, radius, world.cell.ways, boxes[: comm.rank]).any(axis=1).nonzero()
+    rank, row = seen_by(grains.position, radius, world.cell.image_vectors, boxes[: comm.rank]).any(axis=1).nonzero()
     ghosts = exchange(comm, {name: column[row] for name, column in columns.items()}, rank)
     index, ghost_margin = ghosts.pop("index"), ghosts.pop("margin")
     return Neighbourhood(

@@ -143,7 +143,7 @@ class Cell(Named):
         return steps, across
 
     @property
-    def ways(self) -> Floats:
+    def image_vectors(self) -> Floats:
         """The ways (k, 3) of `images` [m]."""
         return self.moved(*self.images())
 
@@ -197,7 +197,7 @@ class Cell(Named):
         reach = 3.0 * bodies.bounding_radius(grains)  # with a margin of two radii, the greatest of `dem.contact`
         return sheared + dt * np.abs(self.rate).max() * reach
 
-    def gone_since(self, then: Cell) -> float:
+    def image_travel(self, then: Cell) -> float:
         """What two grains of a pair have each of the way by which images have moved since `then` [m]."""
         if not self.moves:
             return 0.0
@@ -205,7 +205,7 @@ class Cell(Named):
         most = 2.0 + abs(then.shift) / then.period[0]  # periods along x in the ways of images of a sheared cell
         return 0.5 * (abs(self.shift - then.shift) + float(growth @ (most, 1.0, 1.0)))
 
-    def given_at(self, time: float, dt: float) -> Floats:
+    def given_rates(self, time: float, dt: float) -> Floats:
         """Rates (3,) at which the periods are to grow in the step of dt [s] from the `time` [s]; NaN: what the asked
         stress needs, or none [1/s]."""
         return -self.strain_rate if time >= self.start - 1e-6 * dt else np.full(3, np.nan)

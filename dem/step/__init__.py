@@ -14,7 +14,7 @@ import numpy as np
 from dem import bodies, quaternion
 from dem.arrays import ArrayLike, Bools, Floats, Ints, Keys, places
 from dem.bodies import CLUMP, POLYHEDRON, SPHERE, Bodies
-from dem.contact import Contacts, contact_order, find_contacts, goes_beyond, velocities_about, ways
+from dem.contact import Contacts, contact_order, exceeds_margin, find_contacts, greatest_travel, velocities_about
 from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
 from dem.measures import Sample
@@ -22,7 +22,7 @@ from dem.model.world import World
 from dem.shapes.clumps import arm
 from dem.step.laws import along_normal
 from dem.step.system import ContactSystem, contact_arms, contact_frames, gap_velocities
-from dem.together import meet
+from dem.together import barrier
 from dem.unconstrained import UnconstrainedMotion, large_velocity
 
 #: Of two linearisations of a contact the later one replaces the other: cosine between their normals, at least, and way
@@ -75,7 +75,7 @@ class Step:
     def total(self, values: ArrayLike) -> float:
         """The sum of values (grains,) over all grains; each rank passes those of its `world.grains`. Collective: the
         `record` of a scene must call it on all ranks."""
-        return meet(self.world.comm, "Step.total", number=float(np.sum(values)))
+        return barrier(self.world.comm, "Step.total", number=float(np.sum(values)))
 
     @property
     def in_cone(self) -> Floats:
@@ -192,11 +192,11 @@ def find_overrun(
     The search may be repeated for the contacts that it finds: margins only grow.
     """
     dt, seen = free.dt, contacts.near.margin[: contacts.near.grains]
-    way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
+    way = greatest_travel(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
     way = way + world.cell.margin(dt, world.grains)
     large = large_velocity(world, free, velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
-    gone = bool((way > seen).any()), goes_beyond(world, dt * large, contacts.shifts, delta)
+    gone = bool((way > seen).any()), exceeds_margin(world, dt * large, contacts.shifts, delta)
     further, beyond = on_any(world.comm, *gone)
     if not (further or beyond):
         return None

@@ -7,15 +7,17 @@ the same for moments as for forces.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from dem.arrays import Floats
-from dem.contact import Contacts
 from dem.contact_map import ContactMap, TurningMap
 from dem.model.world import World
-from dem.parts.laws import Met
+from dem.parts.laws import ContactState
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
 
 
 class Resistance(NamedTuple):
@@ -28,7 +30,7 @@ class Resistance(NamedTuple):
 
 
 def resistance(
-    world: World, contacts: Contacts, met: Met | None, known: ContactMap, frame: Floats, free: Floats
+    world: World, contacts: Contacts, met: ContactState | None, known: ContactMap, frame: Floats, free: Floats
 ) -> Resistance | None:
     """Of contacts, as laws have met them, with their map without turning, frames (nc, 3, 3), and the free velocities
     (rows, 6) of all bodies in the rows of `near`; None, on all ranks, in a world without resistance."""

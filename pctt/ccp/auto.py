@@ -22,9 +22,9 @@ from functools import partial
 
 import numpy as np
 
-from dem.exchange import told
+from dem.exchange import broadcast
+from pctt.arrays import Array
 from pctt.ccp import gathered
-from pctt.ccp.cones import Array
 from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
@@ -58,7 +58,7 @@ class Auto:
         """Those of APGD. Small problems have fixed costs; where they are ``few`` those of both methods are calls."""
         per_digit = self.few if few else self.patience * np.cbrt(max(problem.size, 400))
         per_digit *= self.law if coulomb else 1.0
-        return told(problem.comm, int(-np.log10(tol) * per_digit))
+        return broadcast(problem.comm, int(-np.log10(tol) * per_digit))
 
 
 def solve(

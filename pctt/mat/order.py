@@ -91,7 +91,7 @@ def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), told: Array | None = N
         around, row_at = _grid_of_points(points, comm)
         shape = around if row_at is not None else None
         source = f"the grid of {whence}"
-        if shape is not None and np.array_equal(row_at, np.arange(prod(shape))):
+        if shape is not None and row_at is not None and np.array_equal(row_at, np.arange(prod(shape))):
             row_at = None
     return Places(shape, row_at, points, source if shape is not None else whence, around)
 

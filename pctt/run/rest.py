@@ -24,11 +24,11 @@ from dem.arrays import Floats
 from dem.compiled import loop
 from dem.exchange import reduced
 from dem.model.world import World
-from dem.record import energy
+from dem.record.energies import energy
 from dem.step.islands import contacts_at_rest
 from dem.step.system import ContactSystem
+from pctt.arrays import Array
 from pctt.ccp import ConeProblem, Limits, Result, with_part
-from pctt.ccp.cones import Array
 
 Solve = Callable[[ConeProblem, Array, Limits], Result]
 

@@ -12,6 +12,7 @@ from dem import record as recording
 from dem.motion import Guided, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
+from pctt.ccp import newton
 from pctt.run import rest
 
 G, H = 9.81, 0.05  # m/s^2, half the side of boxes [m]
@@ -195,6 +196,18 @@ def test_what_moves_is_solved_to_the_limits_alone():
         sim.step()
         limits = rest.limits_of(sim.settings.limits, sim.world, sim.last.system)
         assert limits.aim == 1.0
+
+
+def test_the_order_of_elimination_is_kept_where_a_part_is_solved_by_itself(monkeypatch):
+    scene = tower(2000.0, 2000.0, 2000.0)
+    scene.add_spheres([[-1, 0, 0.1]], 0.1, 2500.0, velocity=(-2.0, 0, 0), angular_velocity=(0, -20.0, 0))
+    sim, orders = pctt.Simulation(scene, solver="conic", dt=0.005), []
+    sim.run(steps=5)
+    find = newton.order_of
+    monkeypatch.setattr(newton, "order_of", lambda N: orders.append(N) or find(N))
+    sim.run(steps=5)
+    assert sim.figures["cone_problems"] == 1
+    assert not orders
 
 
 def test_iterations_that_lead_nowhere_are_counted():

@@ -10,7 +10,7 @@ import numpy as np
 
 from dem import checks
 from dem.arrays import Floats
-from dem.parts.laws import Law, Met, coefficient
+from dem.parts.laws import ContactState, Law, coefficient
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Rolling(Law):
     def acts(self) -> bool:
         return any(np.any(getattr(self, f.name)) for f in fields(Rolling) if f.name not in _OF_ALL)
 
-    def moments(self, met: Met) -> tuple[Floats, Floats] | None:
+    def moments(self, met: ContactState) -> tuple[Floats, Floats] | None:
         radius = np.where(np.isfinite(met.radius), 0.5 * met.radius, 0.0)  # flat bodies neither roll nor spin so
         rolling = self.rolling[met.pair] + self.rolling_coefficient[met.pair] * radius
         return rolling, self.spinning[met.pair] + self.spinning_coefficient[met.pair] * radius
