@@ -19,7 +19,6 @@ from dem import bodies, quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.exchange import greatest, on_any
 from dem.model.neighbourhood import Neighbourhood, chunk_boxes, seen_by
-from dem.model.world import World
 from dem.parts.cell import Cell
 from dem.shapes import Plane, placed
 from dem.together import SceneError

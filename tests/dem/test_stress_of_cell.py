@@ -145,7 +145,7 @@ def test_products_with_the_map_of_a_cell_are_those_of_a_matrix(turning):
     root, count = given.root, given.rows
     free, G = (system.problem_map.with_mass(mass) for mass in (InverseMass(root), CellMass(comm, root, cell)))
     g, other = random.normal(size=(2, G.rows, 3))
-    way = system.contacts.way(system.near.bodies.position)
+    way = system.contacts.branch(system.near.bodies.position)
     lever = given.frame.reshape(-1, 3, 3) * (way * cell.root)[:, None]
     push = comm.allreduce(np.einsum("cij,ci->j", lever, g[:count]))
     expected = free.velocities(free.momenta(g))
