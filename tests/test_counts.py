@@ -167,6 +167,12 @@ def systems(patch: pytest.MonkeyPatch) -> Counter[str]:
     patch.setattr(by_elimination, "FEW", 0)
     PETSc.Log.begin()
     events = {name: PETSc.Log.Event(name) for name in ("PCSetUp", "PCApply")}
+    before = events["PCSetUp"].getPerfInfo()["count"]
+    pc = PETSc.PC().create(SELF)
+    pc.setOperators(PETSc.Mat().createDense((1, 1), array=[[1.0]], comm=SELF))
+    pc.setUp()
+    if events["PCSetUp"].getPerfInfo()["count"] == before:
+        pytest.skip("an error in a set-up, of another test, has ended PETSc's counts in this process")
     counts: Counter[str] = Counter()
     cases = {
         "contact": ("contact", {}), "body": ("body", {}), "factor": ("body", {"EASY": 0.1}),
