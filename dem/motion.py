@@ -92,7 +92,7 @@ class Driven(Dynamic, Timed):
         most = self.strength(time, dt)
         return (most if self.speed is None else min(max(lack, -most), most)) * self.line
 
-    def grip(self, time: float, dt: float, mass: float, speed: float, lack: float) -> float:
+    def servo_inertia(self, time: float, dt: float, mass: float, speed: float, lack: float) -> float:
         """c dt of a servo [kg or kg m^2], for the mass or moment, and the `speed` before the step; else 0."""
         if self.speed is None:
             return 0.0

@@ -30,13 +30,13 @@ class InverseMass:
     more = 0  #: columns of this rank beside those of bodies
 
     def __init__(self, root: Floats, precision: type[np.floating] = np.float64):
-        self.given, self.precision = root, precision
+        self.inverse_root, self.precision = root, precision
         self.root, self.square = (np.ascontiguousarray(x, dtype=precision) for x in (root, squared(root)))
-        self.alone = self.square  #: M^-1 of the bodies that are in no shared coordinate, else zero
+        self.unshared = self.square  #: M^-1 of the bodies that are in no shared coordinate, else zero
 
     def scaled(self, size: Floats, precision: type[np.floating]) -> InverseMass:
         """The same for contacts whose rows are multiplied by ``size`` (rows, 3)."""
-        return InverseMass(self.given, precision)
+        return InverseMass(self.inverse_root, precision)
 
     def only(self, contacts: Ints) -> InverseMass:
         """The same for these contacts."""
@@ -98,12 +98,12 @@ class ConstrainedMass(InverseMass):
         super().__init__(root, precision)
         self.comm, self.here, self.slot, self.coupling = comm, here, slot, coupling
         self.shared = len(coupling) // 6
-        self.alone = self.square.copy()
-        self.alone[here] = 0.0
+        self.unshared = self.square.copy()
+        self.unshared[here] = 0.0
         self._root = root_blocks(root[here])
 
     def scaled(self, size: Floats, precision: type[np.floating]) -> ConstrainedMass:
-        return ConstrainedMass(self.comm, self.given, self.here, self.slot, self.coupling, precision)
+        return ConstrainedMass(self.comm, self.inverse_root, self.here, self.slot, self.coupling, precision)
 
     def uncoupled(self, z: Floats) -> Floats:
         """(I - K) z for z (shared, 6) of all constrained bodies."""
@@ -194,11 +194,11 @@ class CellMass(InverseMass):
     def scaled(self, size: Floats, precision: type[np.floating]) -> CellMass:
         count = len(self.cell.lever)
         lever = (self.cell.lever.reshape(-1, 3, 3) * size[:count, :, None]).reshape(-1, 9)
-        return CellMass(self.comm, self.given, self.cell._replace(lever=lever), precision)
+        return CellMass(self.comm, self.inverse_root, self.cell._replace(lever=lever), precision)
 
     def only(self, contacts: Ints) -> CellMass:
         lever = np.take(self.cell.lever, contacts, axis=0)
-        return CellMass(self.comm, self.given, self.cell._replace(lever=lever), self.precision)
+        return CellMass(self.comm, self.inverse_root, self.cell._replace(lever=lever), self.precision)
 
     def momenta(self, g: Floats, m: Floats) -> Floats:
         out = np.zeros((len(self.root) + self.more, 6), self.precision)

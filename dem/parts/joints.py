@@ -56,7 +56,7 @@ class Kind(NamedTuple):
     """A kind of joint."""
 
     holds: tuple[bool, ...]  #: which of three translations and three turns, along the axes of the joint; z is the axis
-    way: int = 5  #: the number of its free coordinate among these, that of motors and limits
+    coordinate: int = 5  #: the number of its free coordinate among these, that of motors and limits
     motor: bool = False  #: whether it may have them
     turned: Callable[[Floats, Floats, Floats], tuple[Floats, Floats]] = turned
     axes: int = 1  #: that a user gives; of two the second one is the x axis
@@ -64,7 +64,7 @@ class Kind(NamedTuple):
 
 KINDS = {
     "hinge": Kind((True, True, True, True, True, False), motor=True, turned=turned_about_z),
-    "slider": Kind((True, True, False, True, True, True), way=2, motor=True),
+    "slider": Kind((True, True, False, True, True, True), coordinate=2, motor=True),
     "ball": Kind((True, True, True, False, False, False)),
     "fixed": Kind((True,) * 6),
     "universal": Kind((True, True, True, False, True, False), turned=turned_about_pins, axes=2),
@@ -156,7 +156,7 @@ class Joint(Constraint):
     @property
     def coordinate(self) -> int:
         """The number of its free coordinate among three translations and three turns: that of motors and limits."""
-        return KINDS[self.kind].way
+        return KINDS[self.kind].coordinate
 
     def changed(self, time: float, tally: Any, **values: Any) -> Joint:
         """As of `Named`; with a `speed` there is no `target`, and the other way round."""

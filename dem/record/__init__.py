@@ -283,7 +283,7 @@ def _carried(step: Step, prescribed: Bools) -> float:
     velocity = np.where(prescribed[:, None], step.world.large.velocity, 0.0)
     if not velocity.any():
         return 0.0
-    near, arm = step.contacts.near, step.system.contact_map.given.arm
+    near, arm = step.contacts.near, step.system.contact_map.source.arm
     first, mass = near.grains + near.ghosts, near.bodies.mass
     return carried_energy(velocity, first, mass, step.contacts.a, step.contacts.b, arm)
 

@@ -72,7 +72,7 @@ class BlockICC(Context):
         self.options, self.prefix = Options(), ""
         self.factor: Factor | None = None
         self.places = Places()
-        self._of: Blocks | None = None
+        self._layout: Blocks | None = None
         self._pattern: tuple[np.ndarray, ...] = ()
         self._shift = 0.0  # with which the last matrix of the same pattern had a factor
         self._warned: set[str] = set()
@@ -149,20 +149,20 @@ class BlockICC(Context):
             order = np.arange(graph.shape[0])
         self._source: np.ndarray | None = None
         if of_rows:
-            self._of, self._source = Blocks.of_rows(graph, order)
+            self._layout, self._source = Blocks.of_rows(graph, order)
         else:
-            self._of = Blocks.of(indptr, indices, order)
+            self._layout = Blocks.of(indptr, indices, order)
         self._pattern, self._shift = tuple(array.copy() for array in pattern), 0.0
 
     def _factorise(self, values: Array) -> str:
         """Make the factor of this rank's rows; why there is none, or nothing."""
-        assert self._of is not None
+        assert self._layout is not None
         blocks = values if self._source is None else np.append(values, 0.0)[self._source]
         tau, named = self.options.tau, f"-{self.prefix}{self.options_prefix}"
         automatic = self.options.shift == "auto"
         shift = max(0.5 * tau, self._shift) if automatic else float(self.options.shift)
         while True:
-            found = factorised(self._of, blocks, tau, shift)
+            found = factorised(self._layout, blocks, tau, shift)
             if isinstance(found, Factor):
                 self.factor, self._shift = found, shift
                 return ""
