@@ -94,7 +94,7 @@ def _apart(position: Floats, radius: Floats, box: Floats, cell: Cell, most: int)
 
     Spheres that overlap are pushed apart by a part of the overlap, and go on for a part of the way of the last round.
     """
-    way = np.zeros_like(position)
+    displacement = np.zeros_like(position)
     for rounds in range(most, 0, -1):
         one, other, apart = _pairs(position, radius, cell)
         distance = length(apart)
@@ -107,8 +107,8 @@ def _apart(position: Floats, radius: Floats, box: Floats, cell: Cell, most: int)
         walls = np.where(cell.axes, 0.0, np.clip(position, radius[:, None], box - radius[:, None]) - position)
         if (deep < SWELL * reach / 2.0).all() and (np.abs(walls) < SWELL * radius[:, None] / 2.0).all():
             return position, rounds
-        way = 0.8 * way + 0.15 * (shift + 2.0 * walls)
-        position = cell.wrapped(position + way)
+        displacement = 0.8 * displacement + 0.15 * (shift + 2.0 * walls)
+        position = cell.wrapped(position + displacement)
     raise ValueError(f"a packing of {len(radius)} spheres still overlaps by {(deep / reach).max():.1e} of their size: "
                      "take a lower solid fraction")  # fmt: skip
 
@@ -116,8 +116,8 @@ def _apart(position: Floats, radius: Floats, box: Floats, cell: Cell, most: int)
 def _pairs(position: Floats, radius: Floats, cell: Cell) -> tuple[Floats, Floats, Floats]:
     """Rows (m,) and (m,) of spheres that touch, and the ways (m, 3) from the first to the second or its image."""
     source, moved, reach = [], [], 2.0 * radius.max()
-    for way in cell.image_vectors:  # the first are those in the box
-        image = position + way
+    for vector in cell.image_vectors:  # the first are those in the box
+        image = position + vector
         near = (((image > -reach) & (image < cell.period + reach)) | ~cell.axes).all(axis=1)
         source.append(np.flatnonzero(near))
         moved.append(image[near])

@@ -792,11 +792,11 @@ def _turning(body: LargeBody, motion: Dynamic) -> LargeBody:
     if np.trace(turns) > 1.5:
         return body
     axis = motion.line if isinstance(motion, Hinged) else np.diag(turns)
-    back = quaternion.conjugate(body.quaternion)
-    moment = float(body.inertia @ quaternion.rotate(back, axis) ** 2)
+    inverse_turn = quaternion.conjugate(body.quaternion)
+    moment = float(body.inertia @ quaternion.rotate(inverse_turn, axis) ** 2)
     x = across(axis[None])[0]
     upright = quaternion.from_matrix(np.stack([x, np.cross(axis, x), axis], axis=1))
-    turned = _reframed(body, np.zeros(3), quaternion.multiply(back, upright))
+    turned = _reframed(body, np.zeros(3), quaternion.multiply(inverse_turn, upright))
     return replace(turned, quaternion=upright, inertia=np.array([np.inf, np.inf, moment]))
 
 

@@ -258,8 +258,8 @@ class Simulation:
         if until is not None:
             left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
         first, end, ends = self.steps, self.steps + left, False
-        told = report.Progress(self.comm, quiet=not progress)
-        told.passed(first, self.time, end)
+        progress_report = report.Progress(self.comm, quiet=not progress)
+        progress_report.passed(first, self.time, end)
 
         def tell() -> bool:
             if call is not None and (self.steps - first) % every == 0:
@@ -272,7 +272,7 @@ class Simulation:
                 ends = tell()
             elif call or stop:  # an error of one rank is one of all, and the first rank decides
                 ends = self.comm.bcast(together(self.comm, "call or stop of run", tell))
-            told.passed(self.steps, self.time, self.steps if ends else end)
+            progress_report.passed(self.steps, self.time, self.steps if ends else end)
         self.complete()
 
     # -- what there is ---------------------------------------------------------------------------------------

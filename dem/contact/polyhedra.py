@@ -775,11 +775,11 @@ def _each_once(out, feature, start, own, found, close):
     """Leave out the contacts from `own` on that are in the place of one from `start` on; the new number of contacts."""
     to = own
     for k in range(own, found):
-        alone = True
+        is_new = True
         for n in range(start, own):
             x, y, z = out[k, 0] - out[n, 0], out[k, 1] - out[n, 1], out[k, 2] - out[n, 2]
-            alone &= x * x + y * y + z * z > close * close
-        if alone:
+            is_new &= x * x + y * y + z * z > close * close
+        if is_new:
             out[to], feature[to] = out[k], feature[k]
             to += 1
     return to

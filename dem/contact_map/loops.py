@@ -303,36 +303,36 @@ def extrapolated(m, last_m, beta, i, k):
 def scale_extrapolated(mass, m, last_m, beta, out):
     """out = M^-1 (m + beta (m - last_m)) for the bodies of ``mass``, which is M^-1 in the format of
     `CompactRows.root`."""
-    way = m.dtype.type(beta)
+    factor = m.dtype.type(beta)
     for i in prange(len(mass)):
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
-            mass, i, extrapolated(m, last_m, way, i, 0), extrapolated(m, last_m, way, i, 1),
-            extrapolated(m, last_m, way, i, 2), extrapolated(m, last_m, way, i, 3),
-            extrapolated(m, last_m, way, i, 4), extrapolated(m, last_m, way, i, 5),
+            mass, i, extrapolated(m, last_m, factor, i, 0), extrapolated(m, last_m, factor, i, 1),
+            extrapolated(m, last_m, factor, i, 2), extrapolated(m, last_m, factor, i, 3),
+            extrapolated(m, last_m, factor, i, 4), extrapolated(m, last_m, factor, i, 5),
         )  # fmt: skip
 
 
 @loop
 def energy_of_step(mass, new_m, m, last_m, beta):
     """d' M^-1 d of d = new_m - (m + beta (m - last_m)), summed in double precision over the bodies of ``mass``."""
-    way = m.dtype.type(beta)
+    factor = m.dtype.type(beta)
     sums = np.zeros((len(mass) + PART - 1) // PART)
     for part in prange(len(sums)):
         a, b = part * PART, min(part * PART + PART, len(mass))
-        sums[part] = _energy_of_part(mass[a:b], new_m[a:b], m[a:b], last_m[a:b], way)
+        sums[part] = _energy_of_part(mass[a:b], new_m[a:b], m[a:b], last_m[a:b], factor)
     return sums.sum()
 
 
 @loop
-def _energy_of_part(mass, new_m, m, last_m, way):
+def _energy_of_part(mass, new_m, m, last_m, factor):
     energy = 0.0
     for i in range(len(mass)):
-        d0 = new_m[i, 0] - extrapolated(m, last_m, way, i, 0)
-        d1 = new_m[i, 1] - extrapolated(m, last_m, way, i, 1)
-        d2 = new_m[i, 2] - extrapolated(m, last_m, way, i, 2)
-        d3 = new_m[i, 3] - extrapolated(m, last_m, way, i, 3)
-        d4 = new_m[i, 4] - extrapolated(m, last_m, way, i, 4)
-        d5 = new_m[i, 5] - extrapolated(m, last_m, way, i, 5)
+        d0 = new_m[i, 0] - extrapolated(m, last_m, factor, i, 0)
+        d1 = new_m[i, 1] - extrapolated(m, last_m, factor, i, 1)
+        d2 = new_m[i, 2] - extrapolated(m, last_m, factor, i, 2)
+        d3 = new_m[i, 3] - extrapolated(m, last_m, factor, i, 3)
+        d4 = new_m[i, 4] - extrapolated(m, last_m, factor, i, 4)
+        d5 = new_m[i, 5] - extrapolated(m, last_m, factor, i, 5)
         v0, v1, v2, v3, v4, v5 = scaled_row(mass, i, d0, d1, d2, d3, d4, d5)
         energy += d0 * v0 + d1 * v1 + d2 * v2 + d3 * v3 + d4 * v4 + d5 * v5
     return energy

@@ -83,9 +83,9 @@ def triangle_forces(sample: Sample, body: int, mesh: Mesh, position: Floats, tur
     first, second = (sample.bodies[:, side] == body for side in (0, 1))
     force = sample.force * (second.astype(float) - first)[:, None]
     rows = first | second
-    back, own = quaternion.conjugate(turn), np.array(mesh.quaternion)
+    inverse_turn, own = quaternion.conjugate(turn), np.array(mesh.quaternion)
     point = sample.point[rows, None] + about(sample.lattice)  # a mesh is no longer than the cell
-    point = quaternion.rotate(back, point - position) - np.array(mesh.center)
+    point = quaternion.rotate(inverse_turn, point - position) - np.array(mesh.center)
     point = quaternion.rotate(quaternion.conjugate(own), point) - mesh.surface.middle
     out = np.zeros((len(mesh.surface.triangle), 3))
     np.add.at(out, nearest(mesh.surface, point), force[rows])

@@ -27,8 +27,8 @@ def images(
     rows, steps = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
     if len(point):
         least, most = low - reach - point.max(axis=0), high + reach - point.min(axis=0)
-        back = np.linalg.inv(lattice[np.ix_(axes, axes)])
-        ends = np.stack([least[axes, None] * back, most[axes, None] * back])
+        inverse = np.linalg.inv(lattice[np.ix_(axes, axes)])
+        ends = np.stack([least[axes, None] * inverse, most[axes, None] * inverse])
         first, last = ends.min(axis=0).sum(axis=0), ends.max(axis=0).sum(axis=0)
         slack = 1e-9  # of rounding; the box decides
         for number in product(*map(np.arange, np.ceil(first - slack), np.floor(last + slack) + 1.0)):
@@ -43,9 +43,9 @@ def images(
 
 def about(lattice: Floats) -> Floats:
     """The ways (k, 3) to the next images of a lattice (3, 3) on all sides, and to the point itself [m]."""
-    steps = [np.arange(-1.0, 2.0) if way.any() else np.zeros(1) for way in lattice]
-    ways: Floats = np.array(list(product(*steps))) @ lattice
-    return ways
+    steps = [np.arange(-1.0, 2.0) if vector.any() else np.zeros(1) for vector in lattice]
+    vectors: Floats = np.array(list(product(*steps))) @ lattice
+    return vectors
 
 
 def nearest_image(vector: Floats, lattice: Floats) -> Floats:

@@ -93,11 +93,11 @@ class Images:
         """The rows (nc,) in the table of the neighbourhood of those in the table with images, and by what ways (nc, 3)
         images are moved [m]."""
         last, image = len(self.rows), np.flatnonzero((row >= self.base) & (row < len(self.rows)))
-        way = np.zeros((len(row), 3))
-        way[image] = self.shift[row[image] - self.base]
+        shift = np.zeros((len(row), 3))
+        shift[image] = self.shift[row[image] - self.base]
         out = np.where(row >= last, row - len(self.source), row)
         out[image] = self.source[row[image] - self.base]
-        return out, way
+        return out, shift
 
     def boundaries(self, row: Ints) -> Floats:
         """Numbers (nc,) of sheared boundaries between bodies in rows of the table with images and the cell."""
@@ -142,10 +142,10 @@ def images(world: World, near: Neighbourhood) -> Images:
     large = _boxes(world)
     steps, across = cell.images()
     found = [np.zeros(0, np.int64)]  # of the bodies themselves
-    for way in cell.image_vectors[1:]:
-        rows = touched(position + way, radius, own[None])[0]
+    for vector in cell.image_vectors[1:]:
+        rows = touched(position + vector, radius, own[None])[0]
         if len(large):
-            of_large = touched(position[: near.grains] + way, radius[: near.grains], large[None])[0]
+            of_large = touched(position[: near.grains] + vector, radius[: near.grains], large[None])[0]
             rows = np.union1d(rows, of_large)
         found.append(rows)
     which = np.repeat(np.arange(len(steps)), [len(rows) for rows in found])

@@ -49,7 +49,7 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
         )
     mine, large = world.slabs[comm.rank] + np.arange(len(grains)), world.slabs[-1] + np.arange(len(world.large))
     columns = dict(grains.columns(), margin=margin, index=mine)
-    seen = [touched(grains.position + way, radius, boxes[: comm.rank]) for way in world.cell.image_vectors]
+    seen = [touched(grains.position + vector, radius, boxes[: comm.rank]) for vector in world.cell.image_vectors]
     row, rank = np.concatenate(seen, axis=1)
     rank, row = np.divmod(np.unique(rank * len(grains) + row), max(len(grains), 1))
     ghosts = exchange(comm, {name: column[row] for name, column in columns.items()}, rank)

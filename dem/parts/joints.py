@@ -137,9 +137,9 @@ class Joint(Constraint):
         anchors: list[Any] = []
         frames: list[Any] = []
         for position, turn in (scene.pose(f"joint {name!r}", end) for end in ends):
-            back, arm = quaternion.conjugate(turn), place - position
-            anchors.append(quaternion.rotate(back, arm - scene.cell.whole(arm)))
-            frames.append(tuple(quaternion.multiply(back, upright).tolist()))
+            inverse_turn, arm = quaternion.conjugate(turn), place - position
+            anchors.append(quaternion.rotate(inverse_turn, arm - scene.cell.whole(arm)))
+            frames.append(tuple(quaternion.multiply(inverse_turn, upright).tolist()))
         for body in scene.large_bodies:
             if body.name in ends and isinstance(body.motion, Driven):
                 raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
@@ -168,7 +168,8 @@ class Joint(Constraint):
 
     def conditions(self, error: Floats, dt: float) -> list[Condition]:
         at = error[self.coordinate]
-        found = [Condition(way, HELD, -error[way] / dt) for way in np.flatnonzero(KINDS[self.kind].holds).tolist()]
+        holds = np.flatnonzero(KINDS[self.kind].holds).tolist()
+        found = [Condition(coordinate, HELD, -error[coordinate] / dt) for coordinate in holds]
         if self.driven:
             speed = self.speed if self.target is None else (self.target - at) / dt
             speed = min(max(speed, (self.low - at) / dt), (self.high - at) / dt)  # it stops at its limits

@@ -91,7 +91,7 @@ def _about(world: World, sources: list[Source]) -> tuple[Floats, Floats]:
     largest = np.array([reach(source.extremes()).max() for source in sources])
     boxes += np.array([-1.0, 1.0])[None, :, None] * largest[:, None, None]
     position, radius = world.cell.wrapped(world.grains.position), reach(world.grains)
-    found = [touched(position + way, radius, boxes[None])[0] for way in world.cell.image_vectors]
+    found = [touched(position + vector, radius, boxes[None])[0] for vector in world.cell.image_vectors]
     rows = np.unique(np.concatenate(found)).astype(np.int64)
     parts = world.comm.gather((world.grains.id[rows], position[rows], radius[rows]))
     if parts is None:
@@ -130,8 +130,8 @@ def _free(world: World, place: Floats, radius: Floats) -> Bools:
     free = np.ones(place.shape[:2], bool)
     if not len(world.large) or not free.size:
         return free
-    for way in world.cell.image_vectors:
-        free &= _apart(world, place.reshape(-1, 3) + way, np.repeat(radius, place.shape[1])).reshape(free.shape)
+    for vector in world.cell.image_vectors:
+        free &= _apart(world, place.reshape(-1, 3) + vector, np.repeat(radius, place.shape[1])).reshape(free.shape)
     return free
 
 
@@ -149,11 +149,11 @@ def _apart(world: World, center: Floats, radius: Floats) -> Bools:
     parts = primitives(near, [body.shapes for body in world.large_bodies], count, world.forms).now(near)
     i, j = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for part in range(count, len(parts.kind)):
-        way = center - parts.center[part]
+        offset = center - parts.center[part]
         if parts.kind[part] == PLANE:
-            rows = np.flatnonzero(way @ parts.size[part] <= radius)
+            rows = np.flatnonzero(offset @ parts.size[part] <= radius)
         else:
-            rows = np.flatnonzero((way**2).sum(axis=1) <= (radius + parts.radius[part]) ** 2)
+            rows = np.flatnonzero((offset**2).sum(axis=1) <= (radius + parts.radius[part]) ** 2)
         i.append(rows)
         j.append(np.full(len(rows), part))
     one, other = np.concatenate(i), np.concatenate(j)

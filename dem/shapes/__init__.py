@@ -170,10 +170,10 @@ def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Flo
 
 def moved(shape: Shape, center: Floats, turn: Floats) -> Shape:
     """The shape in a frame with origin `center` (3,) and orientation `turn` (4,) in the present one."""
-    back = quaternion.conjugate(turn)
-    changes: dict[str, Any] = {"center": quaternion.rotate(back, np.array(shape.center) - center)}
+    inverse_turn = quaternion.conjugate(turn)
+    changes: dict[str, Any] = {"center": quaternion.rotate(inverse_turn, np.array(shape.center) - center)}
     if isinstance(shape, Plane):
-        changes["normal"] = quaternion.rotate(back, np.array(shape.normal))
+        changes["normal"] = quaternion.rotate(inverse_turn, np.array(shape.normal))
     elif not isinstance(shape, Sphere):
-        changes["quaternion"] = quaternion.multiply(back, np.array(shape.quaternion))
+        changes["quaternion"] = quaternion.multiply(inverse_turn, np.array(shape.quaternion))
     return replace(shape, **changes)

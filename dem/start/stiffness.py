@@ -220,9 +220,9 @@ def _impacts(scene: Scene, pressed: Pressing, dt: float) -> list[tuple[Floats, f
 def _stopping(mass: Floats, speed: float, layers: float, dt: float, allowed: Floats) -> Floats:
     """The stiffness (n,) that stops these masses within the overlaps `allowed` (n,): the other way round as
     `_stopped`."""
-    ways = layers * speed * dt / allowed
-    x = np.sqrt(np.maximum(4.0 - layers + ways, 0.0)) - 2.0
-    return mass * (np.where(x > 1.0, x, np.minimum(STOPPED * ways / layers, 1.0)) / dt) ** 2
+    travel = layers * speed * dt / allowed
+    x = np.sqrt(np.maximum(4.0 - layers + travel, 0.0)) - 2.0
+    return mass * (np.where(x > 1.0, x, np.minimum(STOPPED * travel / layers, 1.0)) / dt) ** 2
 
 
 def _stopped(mass: Floats, speed: float, layers: float, dt: float, stiffness: float) -> Floats:

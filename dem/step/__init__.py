@@ -110,7 +110,7 @@ class Step:
         if contacts.moved is not None:
             center[:, 1] += contacts.moved
             center += (self.point - contacts.point)[:, None]
-        way, drift = self.world.cell.lattice
+        vectors, drift = self.world.cell.lattice
         number, first, count = near.id[pair], self.world.first_large, self.world.ids
         names = ("id", "position", "velocity", "mass", "shape", "size", "material")
         return Sample(
@@ -125,7 +125,7 @@ class Step:
             gap=contacts.gap,
             force=self.force,
             moment=self.moments,
-            lattice=way,
+            lattice=vectors,
             drift=drift,
         )
 
@@ -189,16 +189,16 @@ def find_overrun(
     The search may be repeated for the contacts that it finds: margins only grow.
     """
     dt, seen = free.dt, contacts.near.margin[: contacts.near.grains]
-    way = greatest_travel(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
-    way = way + world.cell.margin(dt, world.grains)
+    travel = greatest_travel(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
+    travel = travel + world.cell.margin(dt, world.grains)
     large = large_velocity(world, free, velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
-    gone = bool((way > seen).any()), exceeds_margin(world, dt * large, contacts.shifts, delta)
+    gone = bool((travel > seen).any()), exceeds_margin(world, dt * large, contacts.shifts, delta)
     further, beyond = on_any(world.comm, *gone)
     if not (further or beyond):
         return None
     shifts = np.concatenate([contacts.shifts, dt * large[None]]) if beyond else contacts.shifts
-    margin = np.maximum(seen, way)
+    margin = np.maximum(seen, travel)
     unseen = find_contacts(world, delta, free, margin, shifts, contacts.lists, besides=contacts)
     table = velocities_about(unseen, velocity, large)
     opening = _opening(world, unseen, unseen.near.bodies.position, table)
@@ -271,8 +271,8 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
     if world.only_spheres:
         return False
     grains = world.grains
-    way = dt * bodies.bounding_radius(grains) * quaternion.length(velocity[:, 3:])
-    fast, finite = bool((way[grains.shape != SPHERE] > depth).any()), bool(np.isfinite(velocity).all())
+    travel = dt * bodies.bounding_radius(grains) * quaternion.length(velocity[:, 3:])
+    fast, finite = bool((travel[grains.shape != SPHERE] > depth).any()), bool(np.isfinite(velocity).all())
     fast, not_finite = on_any(world.comm, fast, not finite)
     return fast and not not_finite
 
@@ -287,8 +287,8 @@ def _at_start(world: World, end: Contacts, dt: float) -> tuple[Contacts, Floats]
         start = replace(start, point=start.point - 0.5 * dt * flow, moved=end.moved - dt * flow)
     growth = dt * _opening(world, start, position, velocity)
     if world.cell.deforms and start.moved is not None:
-        way = dt * world.cell.rate * position  # of the centres, which the cell takes with it
-        start = replace(start, point=start.point - way[end.a], moved=start.moved + way[end.b] - way[end.a])
+        shift = dt * world.cell.rate * position  # of the centres, which the cell takes with it
+        start = replace(start, point=start.point - shift[end.a], moved=start.moved + shift[end.b] - shift[end.a])
     return replace(start, gap=end.gap - growth), growth
 
 

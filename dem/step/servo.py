@@ -74,5 +74,5 @@ def cell_of(world: World, contacts: Contacts, frame: Floats, dt: float) -> CellS
     root = np.where(follows, 1.0 / np.sqrt(eta * dt * cell.volume), 0.0)
     kept = np.clip(KEPT * cell.rate, -leads, leads)
     free = np.where(follows, kept + (np.diag(stress) - asked) / eta, np.nan_to_num(given))
-    way = contacts.branch(contacts.near.bodies.position)
-    return CellStep((frame * way[:, None]).reshape(-1, 9), root, free)
+    branch = contacts.branch(contacts.near.bodies.position)
+    return CellStep((frame * branch[:, None]).reshape(-1, 9), root, free)

@@ -118,8 +118,8 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     expected, pushed = push.ravel(), B @ push.ravel()
     for _ in range(ROUNDS):
         change = np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
-        alone, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.spin_change[rows])
-        spin[rows] = velocity[rows, 3:] = alone + ends.spin_change[rows]
+        spun, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.spin_change[rows])
+        spin[rows] = velocity[rows, 3:] = spun + ends.spin_change[rows]
         free = J.reshape(len(t), -1) @ velocity.ravel()
         for _ in range(2 * len(t) + 1):
             g = _impulses(A, t, free, on, saturated)

@@ -147,15 +147,15 @@ class Differences:
         """
         n = self.shape[axis]
         values = np.moveaxis(values, axis, 0)
-        back = np.minimum(n - np.arange(n), n - 1) if self.even else np.arange(n) - n
-        return values[:n], values[back], (np.arange(n) / n).reshape(-1, *[1] * (values.ndim - 1))
+        opposite = np.minimum(n - np.arange(n), n - 1) if self.even else np.arange(n) - n
+        return values[:n], values[opposite], (np.arange(n) / n).reshape(-1, *[1] * (values.ndim - 1))
 
     def circulant(self) -> Array:
         """The differences (n_1, ..., n_D, b, b) of the nearest circulant."""
         values = self.values
         for axis in range(len(self.shape)):
-            here, back, part = self._along(axis, values)
-            values = np.moveaxis((1 - part) * here + part * back, 0, axis)
+            here, opposite, part = self._along(axis, values)
+            values = np.moveaxis((1 - part) * here + part * opposite, 0, axis)
         return values
 
     @property
@@ -166,8 +166,8 @@ class Differences:
         sizes[(0,) * len(self.shape)] = 0.0
         largest, found = sizes.max() or 1.0, []
         for axis in range(len(self.shape)):
-            here, back, _ = self._along(axis, self.values)
-            found.append(float(np.abs(here - back)[1:].max(initial=0.0) / largest))
+            here, opposite, _ = self._along(axis, self.values)
+            found.append(float(np.abs(here - opposite)[1:].max(initial=0.0) / largest))
         return found
 
     def steepness(self, axis: int) -> float:
@@ -388,9 +388,9 @@ def choose(a: Differences) -> Choice | None:
     kinds, nearer = [first, NOTHING, *others, *MORE, *[BLOCK_DIAGONAL] * (a.block > 1)], _nearer([a])
     scores: dict[Kind, float] = {}
     trials: list[_Trial] = []
-    alone, spent = [1.0], 0.0
-    for few, most in SHARES:
-        pieces = parts(a, min(few, most / prod(a.shape)))
+    unpreconditioned, spent = [1.0], 0.0
+    for most_share, most in SHARES:
+        pieces = parts(a, min(most_share, most / prod(a.shape)))
         points = sum(prod(part.shape) for part in pieces)
         share = points / prod(a.shape)
         kinds = kinds[: max(2 if share <= PAIR else 1, int(PART / share))]
@@ -403,7 +403,8 @@ def choose(a: Differences) -> Choice | None:
                 return None
             trials.append(trial)
         spent += sum(trial.spent for trial in trials)
-        alone = max((alone, *(trial.runs[NOTHING].norms for trial in trials if NOTHING in trial.runs)), key=at_least)
+        plain = [trial.runs[NOTHING].norms for trial in trials if NOTHING in trial.runs]
+        unpreconditioned = max((unpreconditioned, *plain), key=at_least)
         costs = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}  # the harder part counts
         scores = {kind: cost * max(1.0, cost / scores.get(kind, cost)) for kind, cost in costs.items()}
         lead = 1.0 if a.even else max(1.0, nearer / _nearer(pieces)) ** 1.5
@@ -415,9 +416,10 @@ def choose(a: Differences) -> Choice | None:
         inverse = FastInverse(a, found)
         if not inverse.positive:
             return None
-        return Choice(found, CostEstimate(inverse.each, UNTRIED, alone))
+        return Choice(found, CostEstimate(inverse.each, UNTRIED, unpreconditioned))
     hard = max(trials, key=lambda trial: trial.costs[found])
-    return Choice(found, CostEstimate(hard.runs[found].each, hard.runs[found].norms, alone, spent / prod(a.shape)))
+    run = hard.runs[found]
+    return Choice(found, CostEstimate(run.each, run.norms, unpreconditioned, spent / prod(a.shape)))
 
 
 def _nearer(pieces: Sequence[Differences]) -> float:

@@ -184,17 +184,17 @@ class Growing:
         self.z[0] = self.residual.rest(0, self.x[0])
         self.estimate = float(np.linalg.norm(self.z[0]))
 
-    def _step(self, k: int, way: int) -> None:
-        """Compute core k, and go to the next one (``way`` 1) or to the one before (-1)."""
+    def _step(self, k: int, direction: int) -> None:
+        """Compute core k, and go to the next one (``direction`` 1) or to the one before (-1)."""
         x, z = self.x, self.z
         self._solve(k)
-        left, right = (self.galerkin, self.residual)[::way]
+        left, right = (self.galerkin, self.residual)[::direction]
         new = left.rest_left(right, k, x[k])  # (a, m, n, z) or (z, m, n, b)
         z[k] = self.residual.rest(k, x[k])
-        _push(x, self.signs, k, way, self.most[min(k, k + way)], self.drop, new)
-        z[k] = columns(z[k]) if way > 0 else rows(z[k])
-        self.galerkin.step(k, way, x[k], x[k])
-        self.residual.step(k, way, z[k], x[k])
+        _push(x, self.signs, k, direction, self.most[min(k, k + direction)], self.drop, new)
+        z[k] = columns(z[k]) if direction > 0 else rows(z[k])
+        self.galerkin.step(k, direction, x[k], x[k])
+        self.residual.step(k, direction, z[k], x[k])
 
     def words(self, norm: float) -> str:
         """How far it is, for a message. norm : ||B||"""
@@ -326,18 +326,18 @@ def _with_signs(X: Train, most: list[int]) -> tuple[list[Array], list[Array]]:
 
 
 def _push(
-    x: list[Array], signs: list[Array], k: int, way: int, most: int, drop: float, more: Array | None = None
+    x: list[Array], signs: list[Array], k: int, direction: int, most: int, drop: float, more: Array | None = None
 ) -> None:
     """Give core k, as a matrix (a m n, b), at most ``most`` orthonormal columns, some of them from ``more``.
 
-    The next core takes the other factor. With ``way`` -1 the same for the rows (a, m n b), and the core before.
+    The next core takes the other factor. With ``direction`` -1 the same for the rows (a, m n b), and the core before.
     """
-    turn = (0, 1, 2, 3) if way > 0 else (3, 1, 2, 0)
-    here, there = (k, k + 1)[::way]
+    turn = (0, 1, 2, 3) if direction > 0 else (3, 1, 2, 0)
+    here, there = (k, k + 1)[::direction]
     core, more = x[k].transpose(turn), None if more is None else more.transpose(turn)
     Q, R, signs[there] = _basis(core, signs[here], signs[there], most, drop, more)
     x[k] = np.ascontiguousarray(Q.reshape(*core.shape[:3], -1).transpose(turn))
-    x[k + way] = np.tensordot(R, x[k + 1], 1) if way > 0 else np.tensordot(x[k - 1], R, (3, 1))
+    x[k + direction] = np.tensordot(R, x[k + 1], 1) if direction > 0 else np.tensordot(x[k - 1], R, (3, 1))
 
 
 def _basis(
