@@ -12,7 +12,7 @@ from dem.arrays import Floats, Rule
 from dem.contact.broad import close_pairs
 from dem.geometry.insertion import inserted
 from dem.parts.cell import Cell
-from dem.parts.sources import Listed, Uniform
+from dem.parts.sizes import Listed, Uniform
 from dem.quaternion import length
 
 SPARSE = 0.1  #: solid fraction up to which spheres are put at random places one after another

@@ -34,7 +34,8 @@ from dem.parts.ends import End
 from dem.parts.joints import Joint
 from dem.parts.loads import Law, Load, On
 from dem.parts.named import Named
-from dem.parts.sources import Outlet, Passages, Source
+from dem.parts.passages import Outlet, Passages
+from dem.parts.sources import Source
 from dem.parts.springs import Spring
 from dem.quaternion import across, length
 from dem.shapes import Clump, Shape, clumps, convex, polyhedra

@@ -286,7 +286,7 @@ class Simulation:
     def expected_overlap(self) -> float:
         """The greatest to expect of the contacts as springs, as a part of a half thickness; 0 of rigid contacts. Not
         collective."""
-        return self.overlap_watch.springs
+        return self.overlap_watch.elastic
 
     @property
     def steps(self) -> int:

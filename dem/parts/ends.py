@@ -40,7 +40,7 @@ class Tie(Named):
         object.__setattr__(self, "anchors", anchors)
 
     def refuse(self, name: str, world: Any) -> None:
-        if world.passages.outlets and any(isinstance(end, int) for end in self.ends):
+        if world.passages.removes and any(isinstance(end, int) for end in self.ends):
             kind = type(self).__name__.lower()
             raise ValueError(f"{kind} {name!r} holds a grain: with outlets {kind}s may hold large bodies alone")
 

@@ -112,7 +112,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
 
     Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be, but hold
-    no more than impulses have loaded them with (`dem.start.stiffness.spring_energies`). What they lose or gain
+    no more than impulses have loaded them with (`dem.start.stiffness.elastic_energies`). What they lose or gain
     between two steps is in no term: the spring energy of a step less that before the next.
 
     The jump is the rise of the kinetic energy in a step in which it rises by more than the work of motions, gravity
@@ -131,7 +131,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     velocity[first:][~moves] = world.large.velocity[~moves]
     mean = 0.5 * (velocity[first:] + world.large.velocity)
     normal, tangential, opening = works(step, step.in_cone, velocity, step.moment)
-    elastic, elastic_at_end, strained, strained_at_end = spring_energies(step, velocity, opening)
+    elastic, elastic_at_end, strained, strained_at_end = elastic_energies(step, velocity, opening)
     attracted = 0.0 if system.attraction is None else works(step, step.impulse, velocity)[0] - normal
     applied = belts = flow = 0.0
     if system.applied is not None:
@@ -208,16 +208,16 @@ def works(
     return normal, tangential, opening
 
 
-def spring_energies(step: Step, before: Floats, opening: Floats) -> tuple[float, float, float, float]:
-    """`dem.start.stiffness.spring_energies` of a step, with the velocities `before` (rows, 6) and the normal velocities
-    `opening` (nc,) of its end."""
+def elastic_energies(step: Step, before: Floats, opening: Floats) -> tuple[float, float, float, float]:
+    """`dem.start.stiffness.elastic_energies` of a step, with the velocities `before` (rows, 6) and the normal ones of
+    its end `opening` (nc,)."""
     system, contacts = step.system, step.contacts
     came = system.contact_map.relative_velocities(before)[:, 0]
     if system.drift is not None:
         came = came + system.drift[:, 0]
     gaps = contacts.gap - system.dt * came, contacts.gap, contacts.linear_gap + system.dt * opening
     held = system.last, system.held, step.in_cone
-    return stiffness.spring_energies(system.stiffness, system.compliance, system.dt, *gaps, *held)
+    return stiffness.elastic_energies(system.stiffness, system.compliance, system.dt, *gaps, *held)
 
 
 def _still(table: Bodies, gravity: Floats, dt: float) -> tuple[float, float]:

@@ -16,7 +16,8 @@ from dem.geometry.insertion import inserted
 from dem.model.neighbourhood import Neighbourhood, touched
 from dem.model.partition import redistribute
 from dem.model.world import World
-from dem.parts.sources import MOST_IDS, Source, bounds, reach
+from dem.parts.passages import MOST_IDS
+from dem.parts.sources import Source, bounds, reach
 from dem.record.energies import energy
 from dem.together import SceneError
 

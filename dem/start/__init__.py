@@ -21,7 +21,6 @@ from dem.model.partition import redistribute
 from dem.model.world import World
 from dem.parts.ends import Tie
 from dem.parts.named import Force
-from dem.parts.sources import Passages
 from dem.scene import Scene, kinds_of, least_half
 from dem.shapes.forms import Form
 from dem.start import stiffness
@@ -139,7 +138,7 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     world.named, world.cell = {kind: dict(members) for kind, members in scene.named.items()}, scene.cell
     world.forms = tuple(scene.forms)
     refuse_untouchable(scene.kinds, scene.large_bodies)
-    world.passages = Passages(world.named["source"], dict(scene.passages.outlets)).counted()
+    world.passages = scene.passages.counted(world.named["source"])
     world.initial, world.first_large = scene.count, scene.first_large
     number = {body.name: int(id) for body, id in zip(world.large_bodies, world.large.id)} | {None: -1}
     parts = [part for _, _, members in kinds_of(Tie, world.named) for part in members.values() if not part.touching]

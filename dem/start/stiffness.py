@@ -138,13 +138,13 @@ def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float, 
     stiffness [N/m] and the reduced mass of its bodies [kg]; 0, 0 and 1 of a rigid one."""
     if np.isinf(stiffness):
         return 0.0, 0.0, 1.0
-    spring = stiffness * dt**2
-    C = 1.0 / (spring + 2.0 * DAMPING * np.sqrt(stiffness * mass) * dt)
-    return C, C / TANGENTIAL, spring * C
+    elastic = stiffness * dt**2
+    C = 1.0 / (elastic + 2.0 * DAMPING * np.sqrt(stiffness * mass) * dt)
+    return C, C / TANGENTIAL, elastic * C
 
 
 @loop
-def subtract_tangential_springs(r: Floats, compliance: Floats, held: Floats) -> None:
+def subtract_held_impulses(r: Floats, compliance: Floats, held: Floats) -> None:
     """Take from r (nc, 3) what tangential springs give that held these impulses (nc, 2) before the step."""
     for c in range(len(r)):
         for k in range(2):
@@ -158,13 +158,13 @@ def held_after(stiffness: Floats, compliance: Floats, dt: float, held: Floats, i
     out = np.empty((len(impulse), 3))
     for c in range(len(held)):
         out[c, 0] = impulse[c, 0]
-        out[c, 1], out[c, 2] = _held_by_springs(stiffness, compliance, dt, held, impulse, c)
+        out[c, 1], out[c, 2] = _held_after(stiffness, compliance, dt, held, impulse, c)
     out[len(held) :] = impulse[len(held) :]
     return out
 
 
 @inlined
-def _held_by_springs(stiffness, compliance, dt, held, impulse, c):
+def _held_after(stiffness, compliance, dt, held, impulse, c):
     share = 1.0 if np.isinf(stiffness[c]) else stiffness[c] * dt**2 * compliance[c, 0]
     one = held[c, 0] + share * (impulse[c, 1] - held[c, 0]) if share > 0.0 else 0.0
     other = held[c, 1] + share * (impulse[c, 2] - held[c, 1]) if share > 0.0 else 0.0
@@ -172,7 +172,7 @@ def _held_by_springs(stiffness, compliance, dt, held, impulse, c):
 
 
 @loop
-def spring_energies(
+def elastic_energies(
     stiffness: Floats, compliance: Floats, dt: float, past: Floats, gap: Floats, after: Floats, last: Floats,
     held: Floats, impulse: Floats,
 ) -> tuple[float, float, float, float]:  # fmt: skip
@@ -190,7 +190,7 @@ def spring_energies(
         k, per = stiffness[c], TANGENTIAL * stiffness[c] * dt**2
         start += 0.5 * k * _loaded_overlap(k, compliance[c, 0], dt, past[c], gap[c], last[c]) ** 2
         end += 0.5 * k * _loaded_overlap(k, compliance[c, 0], dt, gap[c], after[c], impulse[c, 0]) ** 2
-        one, other = _held_by_springs(stiffness, compliance, dt, held, impulse, c)
+        one, other = _held_after(stiffness, compliance, dt, held, impulse, c)
         strained += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / per
         strained_at_end += 0.5 * (one**2 + other**2) / per
     return start, end, strained, strained_at_end

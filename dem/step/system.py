@@ -31,7 +31,7 @@ from dem.contact_map.loops import closing, scale
 from dem.contact_map.mass import CellMass, ConstrainedMass
 from dem.contact_map.rows import packed
 from dem.free_motion import kept_spin
-from dem.model.world import World, turns_unlike_spheres
+from dem.model.world import World
 from dem.parts.laws import Solved
 from dem.start import stiffness
 from dem.step.laws import along_normal, contact_state
@@ -156,7 +156,7 @@ class ContactSystem:
         if contacts.swing is not None:  # impacts last no step
             self.b[:, 1:] += np.where(impacts[:, None], 0.0, np.einsum("cij,cj->ci", self.frame[:, 1:], contacts.swing))
         self.r = _beyond(self.b, freely, rounding)
-        stiffness.subtract_tangential_springs(self.r, self.compliance, self.held)
+        stiffness.subtract_held_impulses(self.r, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
 
@@ -167,7 +167,7 @@ class ContactSystem:
         spheres, if it has none yet: that of the `last` impulses (nc, 3); and what the push changes of the velocities
         (owned, 6). Collective."""
         change, push = None, motion.push
-        if push is None and turns_unlike_spheres(world):
+        if push is None and world.turns_unlike_spheres:
             push = self.contact_map.momenta(self.net(last))
         if push is not None:
             change = np.empty(push.shape)

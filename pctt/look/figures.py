@@ -179,9 +179,9 @@ def energy(columns: Mapping[str, np.ndarray]) -> Figure:
     since the beginning of the first step. The drift is the error of the time stepping. Potential energy counts from the
     first record."""
     time = columns["time [s]"]
-    kinetic, potential, spring, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
+    kinetic, potential, elastic, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
     work = work + sum(sign * columns.get(f"{name} [J]", 0.0) for name, sign in OTHERS.items())
-    total = kinetic + spring + potential - potential[0] + np.cumsum(friction + impact - work)
+    total = kinetic + elastic + potential - potential[0] + np.cumsum(friction + impact - work)
     figure = Figure(figsize=(9.5, 6.4))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     above.plot(time, kinetic, label="kinetic energy")

@@ -120,7 +120,7 @@ FEATURES = {
     "springs": Feature(with_body, lambda: with_body("spring"), ("dem/parts/springs.py",)),
     "joints": Feature(with_body, lambda: with_body("joint"), ("dem/parts/joints.py", "contact_map/mass.py")),
     "sources": Feature(bed, rained, ("dem/parts/sources.py", "dem/record/passage.py", "dem/geometry/insertion.py")),
-    "outlets": Feature(bed, drained, ("dem/parts/sources.py", "dem/record/passage.py")),
+    "outlets": Feature(bed, drained, ("dem/parts/passages.py", "dem/record/passage.py")),
     "clumps": Feature(bed, lambda: bed(clumps=True), ("contact/clumps.py", "dem/shapes/clumps.py")),
     "periodic": Feature(bed, lambda: bed(walls=False), ("dem/parts/cell.py", "dem/model/images.py")),
     "shear": Feature(lambda: flow(at_rest=True), flow, ()),
