@@ -21,8 +21,8 @@ TRIES = 100  #: places for a sphere
 
 
 def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -> Rule:
-    """Points (nx ny nz, 3) of the lattice with these coordinates per axis, each moved by up to `perturbation` [m] per
-    axis; z goes on from row to row."""
+    """Return points (nx ny nz, 3) of the lattice with these coordinates per axis, each moved by up to `perturbation`
+    [m] per axis; z goes on from row to row."""
     count = len(x) * len(y) * len(z)
     shift = uniform(-1.0, 1.0, (count, 3), seed)
 
@@ -34,8 +34,8 @@ def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -
 
 
 def uniform(low: float, high: float, shape: tuple[int, ...], seed: int) -> Rule:
-    """The array of this shape that `default_rng(seed).uniform` gives, of which any rows are made without the others: of
-    the generator PCG64 every number takes one step, and it can jump (`advance`)."""
+    """Return the array of this shape that `default_rng(seed).uniform` gives, of which any rows are made without the
+    others: of the generator PCG64 every number takes one step, and it can jump (`advance`)."""
     width = math.prod(shape[1:])
 
     def make(first: int, end: int) -> Floats:
@@ -54,8 +54,8 @@ def random_packing(
     seed: int = 0,
     most: int = 20000,
 ) -> tuple[Floats, Floats]:
-    """Centres (n, 3) and radii (n,) [m] of spheres without overlaps in the box from zero to the `lengths` (3,) [m],
-    with at least this solid `fraction`, up to about 0.6.
+    """Return centres (n, 3) and radii (n,) [m] of spheres without overlaps in the box from zero to the `lengths` (3,)
+    [m], with at least this solid `fraction`, up to about 0.6.
 
     Along `periodic` axes the box repeats itself; others have walls, which spheres do not cross. Spheres of a tenth of
     the volume are put at random places; then they grow from step to step, and what overlaps is pushed apart (Jodrey,

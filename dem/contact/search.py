@@ -102,7 +102,7 @@ def find_contacts(
     world: World, delta: float, free: UnconstrainedMotion | None = None, margin: Floats | float = 0.0,
     shifts: Floats | None = None, lists: Lists | None = None, besides: Contacts | None = None,
 ) -> Contacts:  # fmt: skip
-    """All contacts that this rank owns of the pairs whose margins meet; collective.
+    """Return all contacts that this rank owns of the pairs whose margins meet; collective.
 
     The margin of a body is delta/2 [m], or the way that it goes in a step of the motion `free` without contacts, of a
     grain FURTHER times that, if it is longer; None: where bodies are, not where they will be. So a gap of at most
@@ -198,8 +198,8 @@ def _motions(world: World, near: Neighbourhood, images: Images, prescribed: Floa
 
 
 def velocities_about(contacts: Contacts, velocity: Floats, large: Floats) -> Floats:
-    """Velocities (rows, 6) of all bodies of the neighbourhood of contacts, from those (owned, 6) of the bodies whose
-    rows each rank owns and those (large, 6) of the large bodies; collective."""
+    """Return velocities (rows, 6) of all bodies of the neighbourhood of contacts, from those (owned, 6) of the bodies
+    whose rows each rank owns and those (large, 6) of the large bodies; collective."""
     near = contacts.near
     table = np.zeros((len(near.bodies), 6))
     table[: near.grains] = velocity[: near.grains]
@@ -262,8 +262,8 @@ def named(shapes, number, index, material, friction, features, grains, pairs, co
 
 
 def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Keys) -> Ints:
-    """The order of contacts of bodies in the rows a, b (nc,): first those whose solution needs no other rank, of bodies
-    that this rank owns or whose motion is prescribed; each part by the row of the owner and by key."""
+    """Return the order of contacts of bodies in the rows a, b (nc,): first those whose solution needs no other rank, of
+    bodies that this rank owns or whose motion is prescribed; each part by the row of the owner and by key."""
     foreign = np.zeros(len(near.bodies), dtype=bool)
     foreign[near.grains : near.grains + near.ghosts] = True
     if world.comm.rank < world.comm.size - 1:
@@ -273,8 +273,8 @@ def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Keys
 
 
 def exceeds_margin(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
-    """Whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as in one
-    of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
+    """Return whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as
+    in one of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
     free = bodies.is_dynamic(world.large)
     if not free.any():
         return False

@@ -44,8 +44,8 @@ def branches(sample: Sample, end: Ends, low: Floats, high: Floats, reach: float 
 
 
 def bearing(sample: Sample) -> Bools:
-    """Mask (nc,) of this rank's contacts that bear force: their normal force exceeds 1 % of the mean, as solvers leave
-    small forces at others."""
+    """Return the mask (nc,) of this rank's contacts that bear force: their normal force exceeds 1 % of the mean, as
+    solvers leave small forces at others."""
     normal = np.einsum("ck,ck->c", sample.force, sample.normal)
     total, count = sample.comm.allreduce(np.array([normal.sum(), len(normal)]))
     mask: Bools = normal > 0.01 * total / max(count, 1.0)
@@ -62,7 +62,7 @@ class Grains(NamedTuple):
 
 
 def per_grain(sample: Sample) -> Grains:
-    """Contact force, torque, stress times volume, and coordination number of every grain."""
+    """Return the contact force, torque, stress times volume, and coordination number of every grain."""
     end = ends(sample)
     arm = end.point - end.center
     moment = -end.force[:, :, None] * arm[:, None, :]
@@ -75,7 +75,7 @@ def per_grain(sample: Sample) -> Grains:
 
 
 def triangle_forces(sample: Sample, body: int, mesh: Mesh, position: Floats, turn: Floats) -> Floats:
-    """Forces (triangles, 3) of grains on the triangles of a mesh, in the world frame [N].
+    """Return forces (triangles, 3) of grains on the triangles of a mesh, in the world frame [N].
 
     The mesh is all of the large body of this number (`Sample.bodies`) at `position` (3,) [m] and orientation `turn`
     (4,). A contact's force is that of the triangle nearest to its point, or to an image of it: searches keep no

@@ -32,7 +32,7 @@ class Neighbourhood:
 
 
 def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
-    """All bodies whose margin may meet the margin of a local grain; `margin` (grains,) [m] of the local grains;
+    """Return all bodies whose margin may meet the margin of a local grain; `margin` (grains,) [m] of the local grains;
     collective.
 
     FloatingPointError, on all ranks, if a position or margin is not finite.
@@ -64,8 +64,8 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
 
 
 def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> Neighbourhood:
-    """The same bodies as they are now, with these margins (grains,) [m] of the local ones; the halo is that of the
-    grains of `near`; collective."""
+    """Return the same bodies as they are now, with these margins (grains,) [m] of the local ones; the halo is that of
+    the grains of `near`; collective."""
     grains, count = near.grains, near.grains + near.ghosts
     ghosts = np.empty((0, 14))
     if world.comm.size > 1:  # one message with all that steps change
@@ -82,7 +82,7 @@ def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> 
 
 
 def chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:
-    """Bounding boxes (count, 2, 3) of equal pieces of a slab; empty ones reach from +inf to -inf."""
+    """Return bounding boxes (count, 2, 3) of equal pieces of a slab; empty ones reach from +inf to -inf."""
     boxes = np.empty((count, 2, 3))
     boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
     if not (np.isfinite(position).all() and np.isfinite(radius).all()):
@@ -96,7 +96,7 @@ def chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:
 
 
 def touched(position: Floats, radius: Floats, boxes: Floats) -> tuple[Ints, Ints]:
-    """Pairs (row, rank) of the balls that touch a box of a rank; boxes (ranks, k, 2, 3)."""
+    """Return pairs (row, rank) of the balls that touch a box of a rank; boxes (ranks, k, 2, 3)."""
     rows, ranks = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     if len(position) and len(boxes):
         low, high = (position - radius[:, None]).min(axis=0), (position + radius[:, None]).max(axis=0)

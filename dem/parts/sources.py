@@ -149,7 +149,7 @@ class Tally:
 
 
 def bounds(region: Block | Cylinder) -> Floats:
-    """The lower and upper corner (2, 3) of the box about a region [m]."""
+    """Return the lower and upper corner (2, 3) of the box about a region [m]."""
     if isinstance(region, Block):
         return np.array([region.low, region.high], float)
     ends = np.array([region.start, region.end], float)
@@ -159,7 +159,7 @@ def bounds(region: Block | Cylinder) -> Floats:
 
 
 def points(region: Block | Cylinder, random: Floats) -> Floats:
-    """Points (n, 3) that are uniform in a region, from numbers (n, 3) from 0 to 1."""
+    """Return points (n, 3) that are uniform in a region, from numbers (n, 3) from 0 to 1."""
     if isinstance(region, Block):
         low, high = bounds(region)
         return low + random * (high - low)
@@ -171,7 +171,7 @@ def points(region: Block | Cylinder, random: Floats) -> Floats:
 
 
 def numbers(name: str, seed: int, serial: Ints, draws: range) -> Floats:
-    """Random numbers (n, draws) from 0 to 1 of the grains (n,) of a source, which depend on nothing else.
+    """Return random numbers (n, draws) from 0 to 1 of the grains (n,) of a source, which depend on nothing else.
 
     A hash of the counters: the mixer of SplitMix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number
     generators", OOPSLA 2014), once for the source, once for the grain and once for the draw."""
@@ -196,12 +196,12 @@ def _turns(random: Floats) -> Floats:
 
 
 def refuse_region(what: str, region: Any) -> None:
-    """ValueError for what is no region."""
+    """Raise ValueError for what is no region."""
     if not isinstance(region, (Block, Cylinder)):
         raise ValueError(f"region of a {what}: allowed is a Block or a Cylinder of dem.measures, got {region!r}")
 
 
 def reach(table: Bodies) -> Floats:
-    """Radii (n,) of the spheres about grains [m]."""
+    """Return radii (n,) of the spheres about grains [m]."""
     return enclosing_radius(table.shape, table.size)
 

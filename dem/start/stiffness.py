@@ -52,14 +52,14 @@ DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed 
 
 
 def pairs(scene: Scene) -> ContactLaw:
-    """The coefficients of contacts by pair of materials, with the recommended stiffness where none is stated."""
+    """Return the coefficients of contacts by pair of materials, with the recommended stiffness where none is stated."""
     return scene.pairs(recommended(scene))
 
 
 def recommended(scene: Scene) -> float:
-    """The stiffness [N/m] with which no grain of a scene overlaps by more than OVERLAP half thicknesses, whether under
-    the weight of the bed above it, pressed by a spring, a load, a motor or a tool, pushed by the fastest tool or met by
-    the fastest grain, nor by more than FALLEN of them after a fall, to two digits; inf if there is none of them.
+    """Return the stiffness [N/m] with which no grain of a scene overlaps by more than OVERLAP half thicknesses, whether
+    under the weight of the bed above it, pressed by a spring, a load, a motor or a tool, pushed by the fastest tool or
+    met by the fastest grain, nor by more than FALLEN of them after a fall, to two digits; inf if there is none of them.
 
     The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width, and
     four times as much where a chain of force goes (Radjai, Jean, Moreau, Roux, Phys. Rev. Lett. 77 (1996): a share of
@@ -85,8 +85,8 @@ def recommended(scene: Scene) -> float:
 
 
 def expected_overlap(scene: Scene, stiffness: float, dt: float) -> float:
-    """The greatest overlap, as a part of a half thickness, that `recommended` would expect of a stiffness [N/m] in
-    steps of dt [s]."""
+    """Return the greatest overlap, as a part of a half thickness, that `recommended` would expect of a stiffness [N/m]
+    in steps of dt [s]."""
     if np.isinf(stiffness):
         return 0.0
     grains, pressed = scene.expected(), pressing(scene)
@@ -100,7 +100,7 @@ def expected_overlap(scene: Scene, stiffness: float, dt: float) -> float:
 
 
 def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:
-    """The stiffness E R [N/m] of the contact of two equal spheres of Young's modulus E [Pa] and radius R [m].
+    """Return the stiffness E R [N/m] of the contact of two equal spheres of Young's modulus E [Pa] and radius R [m].
 
     Source: the linear law of Yade (Smilauer et al., documentation of `Ip2_FrictMat_FrictMat_FrictPhys`), for equal
     spheres; for others take the harmonic mean of E R of both."""

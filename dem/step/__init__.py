@@ -166,7 +166,7 @@ def advance(
 
 
 def advanced(world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats) -> World:
-    """The world that `advance` leads to; this one stays as it is. Collective."""
+    """Return the world that `advance` leads to; this one stays as it is. Collective."""
     after = world.trial()
     advance(after, free, contacts, velocity)
     return after
@@ -182,9 +182,9 @@ def find_overrun(
     world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats, delta: float, depth: float,
     recovery_speed: float,
 ) -> Contacts | None:  # fmt: skip
-    """The contacts of wider margins, if with these velocities (owned, 6) bodies go further in the step than their
-    margins in the search for `contacts`, and overlap by more than `depth` [m] with others that it has not seen. None if
-    none do; collective.
+    """Return the contacts of wider margins, if with these velocities (owned, 6) bodies go further in the step than
+    their margins in the search for `contacts`, and overlap by more than `depth` [m] with others that it has not seen.
+    None if none do; collective.
 
     The search may be repeated for the contacts that it finds: margins only grow.
     """
@@ -221,8 +221,9 @@ def find_turned(
     world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats, depth: float,
     recovery_speed: float, tried: int,
 ) -> Contacts | None:  # fmt: skip
-    """The contacts, with those that overlap by more than `depth` [m] if bodies go on for a step with these velocities
-    (owned, 6); None if there are none, or if the grains that are no spheres turn by less than that; collective.
+    """Return the contacts, with those that overlap by more than `depth` [m] if bodies go on for a step with these
+    velocities (owned, 6); None if there are none, or if the grains that are no spheres turn by less than that;
+    collective.
 
     A step takes the gap of a contact as linear in the velocities. Where bodies turn, its point and its normal move, and
     other points may meet. What overlaps at the end of the step is linearised there: with the normal n of the end, and
@@ -303,7 +304,8 @@ def _rows_in(contacts: Contacts, end: Contacts) -> tuple[Ints, Ints, Bools]:
 
 
 def carried(world: World, contacts: Contacts, wider: Contacts) -> Contacts:
-    """The contacts of a wider search, where they are among these as these: `find_turned` has linearised some anew."""
+    """Return the contacts of a wider search, where they are among these as these: `find_turned` has linearised some
+    anew."""
     a, b, known = _rows_in(wider, contacts)
     kept = replace(contacts, a=a, b=b, near=wider.near, shifts=wider.shifts).take(known)
     return _joined(world, wider.take(places(kept.key, wider.key) < 0), kept)

@@ -374,7 +374,7 @@ def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> 
 def gap_velocities(
     world: World, contacts: Contacts, dt: float, recovery_speed: float
 ) -> tuple[Floats, Floats, Floats]:
-    """`dem.start.stiffness.gap_velocities` of these contacts."""
+    """Return `dem.start.stiffness.gap_velocities` of these contacts."""
     table, rows = contacts.near.bodies, (contacts.a, contacts.b)
     return stiffness.gap_velocities(
         world.pairs.stiffness, table.material, table.mass, *rows, contacts.linear_gap, dt, float(recovery_speed)
@@ -382,8 +382,8 @@ def gap_velocities(
 
 
 def inverse_root_masses(world: World, drives: Drives) -> Floats:
-    """M^-1/2 of the bodies whose rows this rank owns, as `CompactRows.root` has it: (owned, 6) where that is all on all
-    ranks, else (owned, 12)."""
+    """Return M^-1/2 of the bodies whose rows this rank owns, as `CompactRows.root` has it: (owned, 6) where that is all
+    on all ranks, else (owned, 12)."""
     last = world.comm.rank == world.comm.size - 1
     tables = [world.grains, with_servos(world.large, drives)] if last else [world.grains]
     if world.only_spheres and not bodies.is_dynamic(world.large).any():
@@ -410,7 +410,7 @@ def _inverse_roots(mass: Floats, inertia: Floats) -> Floats:
 
 
 def with_servos(large: Bodies, drives: Drives) -> Bodies:
-    """The large bodies with what servos add to their masses and to their moments about hinges."""
+    """Return the large bodies with what servos add to their masses and to their moments about hinges."""
     if not drives.servo_inertia.any():
         return large
     mass, inertia = large.mass.copy(), large.inertia.copy()
@@ -421,7 +421,7 @@ def with_servos(large: Bodies, drives: Drives) -> Bodies:
 
 
 def contact_frames(normal: Floats) -> Floats:
-    """Orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
+    """Return orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
 
     Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
     but where the sign of its z component changes.
@@ -444,8 +444,8 @@ def _frames(normal: Floats) -> Floats:
 
 
 def contact_arms(contacts: Contacts, position: Floats, row: np.ndarray) -> Floats:
-    """Vectors (nc, 6) from the centres of the two bodies of each contact, or of the image of the second, to its point;
-    `row` (nc, 2) are the bodies' rows, uint32, in a table of positions (rows, 3) [m]."""
+    """Return vectors (nc, 6) from the centres of the two bodies of each contact, or of the image of the second, to its
+    point; `row` (nc, 2) are the bodies' rows, uint32, in a table of positions (rows, 3) [m]."""
     moved = np.zeros((0, 3)) if contacts.moved is None else contacts.moved
     return _arms(contacts.point, moved, position, row)
 

@@ -50,7 +50,7 @@ class UnconstrainedMotion:
 
 
 def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
-    """The motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a part
+    """Return the motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a part
     fails."""
     positive("time step", dt)
     poses = world.poses(world.time + dt)

@@ -66,7 +66,7 @@ def invert(
     S: Train, max_rank: int = 10, start: Train | None = None, sweeps: int | None = None, eps: float = 0.0,
     rng: np.random.Generator | None = None,
 ) -> Inverse:  # fmt: skip
-    """The inverse of a symmetric positive definite S with ranks at most `max_rank`.
+    """Return the inverse of a symmetric positive definite S with ranks at most `max_rank`.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def invert_near_identity(
     T: Train, max_rank: int = 10, start: Train | None = None, sweeps: int | None = None, eps: float = 0.0,
     rng: np.random.Generator | None = None, work: Work | None = None,
 ) -> Inverse:  # fmt: skip
-    """The inverse of S = I + T as X = I + Z, with an exact identity; arguments as in `invert`.
+    """Return the inverse of S = I + T as X = I + Z, with an exact identity; arguments as in `invert`.
 
     The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z. `work`
     counts operations. Near its limit the ranks do not grow any more, and at the limit the result of the last whole
@@ -118,7 +118,7 @@ def invert_positive(
 
 
 def residual(S: Train, X: Train, B: Train | None = None) -> float:
-    """||B - S X||_F / ||B||_F in train arithmetic; by default B is the identity.
+    """Return ||B - S X||_F / ||B||_F in train arithmetic; by default B is the identity.
 
     The cost grows with the product of the ranks of S and X. If this product is high, the result is an estimate from
     products with random trains, with an error of about a third.

@@ -106,7 +106,8 @@ def rows(x: Array) -> Array:
 
 
 def lowest(X: Train) -> float:
-    """An upper bound of the least eigenvalue of a symmetric X; a negative value proves that X is not positive definite.
+    """Return an upper bound of the least eigenvalue of a symmetric X; a negative value proves that X is not positive
+    definite.
 
     It is the least v'Xv / v'v that an alternating search over trains v finds. Their rank is 8, or 4 with modes above
     8, which cost more.
