@@ -95,7 +95,7 @@ class Column:
     check: Callable[[str, ArrayLike], Floats]
 
     @classmethod
-    def of(
+    def checked(
         cls, name: str, values: ArrayLike, count: int, *row: int, check: Callable[..., Floats] = checks.finite
     ) -> Column:
         """ValueError for what is none; rows by a rule are checked when they are made."""
@@ -705,14 +705,15 @@ class Scene:
         if not isinstance(positions, Rule):
             positions = np.atleast_2d(checks.finite("positions", positions))
         count, first = len(positions), self.count
-        columns = [Column.of("positions", positions, count, 3)]
+        columns = [Column.checked("positions", positions, count, 3)]
         row = (3,) if kind == BOX else ()
-        columns += [Column.of(name, values, count, *row, check=checks.positive) for name, values in lengths.items()]
+        for name, values in lengths.items():
+            columns.append(Column.checked(name, values, count, *row, check=checks.positive))
         columns += [
-            Column.of("density", density, count, check=checks.positive),
-            Column.of("quaternions", quaternions, count, 4, check=checks.not_zero),
-            Column.of("velocity", velocity, count, 3),
-            Column.of("angular velocity", angular_velocity, count, 3),
+            Column.checked("density", density, count, check=checks.positive),
+            Column.checked("quaternions", quaternions, count, 4, check=checks.not_zero),
+            Column.checked("velocity", velocity, count, 3),
+            Column.checked("angular velocity", angular_velocity, count, 3),
         ]
         given = {column.name: column for column in columns}
         if not isinstance(material, str) and len(material) != count:

@@ -117,7 +117,7 @@ scene.add_spheres(points[points[:, 0] > 0.5], 0.05, 2500.0, material="right")
 sim = pctt.Simulation(scene, dt=0.001)
 sim.step()
 sample = sim.sample
-mixing = measures.mixing(sample, sample.of("left"), measures.Block((0, 0, 0), (1, 1, 1)), (4, 4, 4))
+mixing = measures.mixing(sample, sample.of_material("left"), measures.Block((0, 0, 0), (1, 1, 1)), (4, 4, 4))
 print("two halves apart: Lacey's index", mixing.lacey, "segregation", mixing.intensity)
 
 # %% dem.measures.Profile

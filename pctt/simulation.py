@@ -106,7 +106,7 @@ class Simulation:
         self._compare = compare or ccp.Comparison(comm, [])
         compared = bool(self._compare.names)
         self.settings = together(
-            comm, "settings", lambda: made(Settings, given).of(self.experiment, compared), own=(OptionError,)
+            comm, "settings", lambda: made(Settings, given).completed_for(self.experiment, compared), own=(OptionError,)
         )
         scene = state.built(self.experiment, comm)
         self.dt_reason = reason(scene) if self.settings.dt is None else ""

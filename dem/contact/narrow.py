@@ -86,7 +86,7 @@ class ContactBuffer(NamedTuple):
     out: Floats  #: (room, 7) points, normals and gaps
 
     @classmethod
-    def of(cls, room: int) -> ContactBuffer:
+    def with_room(cls, room: int) -> ContactBuffer:
         """Room for so many."""
         return cls(np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7)))
 

@@ -68,7 +68,7 @@ def compressed_entries(
 
     start : an earlier result for a similar matrix
     """
-    entries = Entries.of(P)
+    entries = Entries.of_mat(P)
     matrix = EntryMatrix(entries, layout.digits, layout.rows, layout.comm.bcast)
     known = start.found if start is not None and start.layout.digits.modes == layout.digits.modes else None
     found = compress_cross(matrix, max_rank, eps, known, work=work)

@@ -44,7 +44,7 @@ class PartialCholesky:
     """
 
     def __init__(self, P: PETSc.Mat) -> None:
-        self.comm, self.entries = P.comm.tompi4py(), Entries.of(P)
+        self.comm, self.entries = P.comm.tompi4py(), Entries.of_mat(P)
         self.first, self.last = P.getOwnershipRange()
         self.rows = P.getSize()[0]
         self.left = diagonal(P)

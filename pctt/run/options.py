@@ -66,7 +66,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         _refuse_for_petsc(database, form, compare)
     _refuse_places(run, comm)
     together(comm, "option -threads", lambda: _start_threads(run.threads), own=(OptionError,))
-    return Options(run, scene, asked.of(scene, relaxed=bool(run.problem or run.compare)), demo, database)
+    return Options(run, scene, asked.completed_for(scene, relaxed=bool(run.problem or run.compare)), demo, database)
 
 
 def _start_threads(count: int) -> None:

@@ -368,7 +368,7 @@ def _settle(
     tenth, tol, begun = max(1, end // 10), settings.settle_tol, time.perf_counter()
     say(f"settling {scene_name(experiment)}, {end} steps with APGD to {tol:g}:")
     loose = Settings(dt=dt, delta=falling, solver="apgd", tol=tol, law=ccp.RELAXATION, overlap=settings.overlap)
-    loose = loose.of(experiment)
+    loose = loose.completed_for(experiment)
     world = world_at_start(experiment, loose, scene, comm)
     memory = ImpulseMemory(comm, world.pairs.parts, world.pairs.columns)
     if comm.bcast(unfinished(path).exists()):

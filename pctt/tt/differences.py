@@ -398,7 +398,7 @@ def choose(a: Differences) -> Choice | None:
             break
         trials = []
         for part in pieces:
-            trial = _Trial.of(part, kinds)
+            trial = _Trial.run_with(part, kinds)
             if trial is None:
                 return None
             trials.append(trial)
@@ -443,7 +443,7 @@ class _Trial:
         self.costs = dict(zip(self.runs, race(list(self.runs.values()), SLACK, MOST)))
 
     @classmethod
-    def of(cls, a: Differences, kinds: Sequence[Kind]) -> _Trial | None:
+    def run_with(cls, a: Differences, kinds: Sequence[Kind]) -> _Trial | None:
         """None if A is not positive definite."""
         inverses = {kind: FastInverse(a, kind) for kind in kinds}
         if not all(inverse.positive for inverse in inverses.values()):
