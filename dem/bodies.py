@@ -62,25 +62,25 @@ class Bodies(Tabular):
 
 
 def concatenate(parts: Sequence[Bodies]) -> Bodies:
-    """One table of the rows of several, in their order."""
+    """Return one table of the rows of several, in their order."""
     names = [field.name for field in fields(Bodies)]
     return Bodies(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def none() -> Bodies:
-    """A table without rows."""
+    """Return a table without rows."""
     vectors, numbers, whole = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
     turn, velocity = np.zeros((0, 4)), np.zeros((0, 6))
     return Bodies(whole, vectors, turn, velocity, numbers, vectors, whole, whole, vectors, numbers)
 
 
 def is_dynamic(bodies: Bodies) -> Bools:
-    """Mask (n,) of the bodies that forces can move."""
+    """Return the mask (n,) of the bodies that forces can move."""
     return np.isfinite(bodies.mass)
 
 
 def bounding_radius(bodies: Bodies) -> Floats:
-    """Radius (n,) of the sphere about the centre that encloses a grain [m]."""
+    """Return the radius (n,) of the sphere about the centre that encloses a grain [m]."""
     return enclosing_radius(bodies.shape, bodies.size)
 
 
@@ -99,25 +99,26 @@ def enclosing_radius(kind: Ints, size: Floats) -> Floats:
 
 
 def least_half_thickness(bodies: Bodies) -> Floats:
-    """Radius (n,) of the greatest sphere that fits into a grain [m]."""
+    """Return the radius (n,) of the greatest sphere that fits into a grain [m]."""
     return half_thickness(bodies.shape, bodies.size)
 
 
 def half_thickness(kind: Ints, size: Floats) -> Floats:
-    """Radius (n,) of the greatest sphere that fits into a shape of kind (n,) and size (n, 3), as of `dem.shapes.placed`
-    [m]; of a mesh into the box about it."""
+    """Return the radius (n,) of the greatest sphere that fits into a shape of kind (n,) and size (n, 3), as of
+    `dem.shapes.placed` [m]; of a mesh into the box about it."""
     half = np.where(np.isin(kind, (BOX, MESH)), size.min(axis=1), size[:, 0])
     return np.where(kind >= FORM, size[:, 2], half)
 
 
 def turning(bodies: Bodies) -> Floats:
-    """Angular speeds (n,) of bodies that are no spheres [rad/s]; zero of spheres, and of what does not turn freely."""
+    """Return angular speeds (n,) of bodies that are no spheres [rad/s]; zero of spheres, and of what does not turn
+    freely."""
     x, y, z = bodies.velocity[:, 3:].T
     speed: Floats = np.hypot(np.hypot(x, y), z)  # squares could overflow
     return np.where((bodies.shape == SPHERE) | np.isinf(bodies.inertia).any(axis=1), 0.0, speed)
 
 
 def inverse_root_inertia(bodies: Bodies) -> Floats:
-    """Symmetric square roots (n, 3, 3) of the inverse inertia tensors in the world frame."""
+    """Return symmetric square roots (n, 3, 3) of the inverse inertia tensors in the world frame."""
     turn = quaternion.matrix(bodies.quaternion)
     return (turn / np.sqrt(bodies.inertia)[:, None, :]) @ turn.transpose(0, 2, 1)

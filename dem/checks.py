@@ -12,15 +12,15 @@ from dem.arrays import ArrayLike, Floats
 
 
 def nearest(name: str, known: Iterable[str], dash: str = "", alike: float = 0.6) -> str:
-    """The end of a message: the known name that the user may have meant, if the two are ``alike`` (of `difflib`), or
-    that is the beginning of the name."""
+    """Return the end of a message: the known name that the user may have meant, if the two are ``alike`` (of
+    `difflib`), or that is the beginning of the name."""
     begins = sorted((each for each in known if len(each) > 2 and name.startswith(each)), key=len, reverse=True)
     close = begins or difflib.get_close_matches(name, sorted(known), n=1, cutoff=alike)
     return f"; did you mean {dash}{close[0]}?" if close else ""
 
 
 def finite(name: str, values: ArrayLike) -> Floats:
-    """`values` as a float array; ValueError if a number is NaN or infinite."""
+    """Return `values` as a float array; ValueError if a number is NaN or infinite."""
     array = np.asarray(values, dtype=np.float64)
     if not np.isfinite(array).all():
         raise ValueError(f"{name}: NaN or infinite number")
@@ -28,7 +28,7 @@ def finite(name: str, values: ArrayLike) -> Floats:
 
 
 def positive(name: str, values: ArrayLike) -> Floats:
-    """`values` as a float array; ValueError unless all are finite and above zero."""
+    """Return `values` as a float array; ValueError unless all are finite and above zero."""
     array = finite(name, values)
     if (array <= 0.0).any():
         raise ValueError(f"{name} must be positive, got {array.min():g}")
@@ -36,13 +36,13 @@ def positive(name: str, values: ArrayLike) -> Floats:
 
 
 def positive_or_inf(name: str, value: float) -> None:
-    """ValueError unless a number is above zero; inf is."""
+    """Raise ValueError unless a number is above zero; inf is."""
     if not value > 0.0:
         raise ValueError(f"{name} must be positive, or inf, got {value:g}")
 
 
 def not_negative(name: str, values: ArrayLike) -> Floats:
-    """`values` as a float array; ValueError unless all are finite and not below zero."""
+    """Return `values` as a float array; ValueError unless all are finite and not below zero."""
     array = finite(name, values)
     if (array < 0.0).any():
         raise ValueError(f"{name} must not be negative, got {array.min():g}")
@@ -50,7 +50,7 @@ def not_negative(name: str, values: ArrayLike) -> Floats:
 
 
 def between(low: float, high: float = np.inf) -> Callable[[str, float], None]:
-    """A check that a number is not below `low` and not above `high`."""
+    """Return a check that a number is not below `low` and not above `high`."""
 
     def check(name: str, value: float) -> None:
         if not low <= value <= high:
@@ -61,25 +61,26 @@ def between(low: float, high: float = np.inf) -> Callable[[str, float], None]:
 
 
 def rows(name: str, values: ArrayLike, count: int, *row: int) -> Floats:
-    """`values` as finite numbers (count, *row); one row stands for all."""
+    """Return `values` as finite numbers (count, *row); one row stands for all."""
     array = finite(name, values)
     shape(name, array, count, *row)
     return np.broadcast_to(array, (count, *row)).copy()
 
 
 def shape(name: str, array: Floats, count: int, *row: int) -> None:
-    """ValueError unless an array has the shape (count, *row), or that of one row."""
+    """Raise ValueError unless an array has the shape (count, *row), or that of one row."""
     if array.shape not in (row, (count, *row)):
         raise ValueError(f"{name} must have shape {row} or {(count, *row)}, got {array.shape}")
 
 
 def vector(name: str, values: ArrayLike) -> Floats:
-    """Three finite numbers."""
+    """Return three finite numbers."""
     return rows(name, values, 1, 3)[0]
 
 
 def unit_vector(name: str, values: ArrayLike) -> Floats:
-    """Three finite numbers, not all zero, scaled to unit length. A vector of that length, to rounding, comes back."""
+    """Return three finite numbers, not all zero, scaled to unit length. A vector of that length, to rounding, comes
+    back."""
     array = vector(name, values)
     length = np.linalg.norm(array)
     if length == 0.0:
@@ -88,7 +89,7 @@ def unit_vector(name: str, values: ArrayLike) -> Floats:
 
 
 def not_zero(name: str, values: ArrayLike) -> Floats:
-    """`values` as a float array; ValueError if one of the quaternions in its rows is zero."""
+    """Return `values` as a float array; ValueError if one of the quaternions in its rows is zero."""
     array = finite(name, values)
     if (np.linalg.norm(np.atleast_1d(array), axis=-1) == 0.0).any():
         raise ValueError(f"{name}: zero quaternion")
@@ -96,7 +97,7 @@ def not_zero(name: str, values: ArrayLike) -> Floats:
 
 
 def unit_quaternion(name: str, values: ArrayLike) -> Floats:
-    """One quaternion (4,), scaled to unit norm."""
+    """Return one quaternion (4,), scaled to unit norm."""
     array = rows(name, values, 1, 4)
     size = np.linalg.norm(array, axis=1, keepdims=True)
     if size[0, 0] == 0.0:

@@ -3,7 +3,8 @@
 numba is imported, and a loop compiled, at its first call: the import takes half a second. The machine code is kept on
 disk. Arrays are C-contiguous; of other types or layouts a loop would be compiled once more.
 Tables that loops take are plain tuples (`named[:]`) of at most four arrays: of longer and of named ones numba finds the
-type in Python, at every call.
+type in Python, at every call. Within compiled code tuples and named tuples of any length cost nothing but the counts of
+their arrays. A loop has nine parameters at most.
 
 A loop over `prange` whose passes do not depend on each other is compiled twice, for one thread and for several
 (`set_threads`). Sums are of parts of fixed length, so that they do not depend on the number of threads.

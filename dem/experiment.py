@@ -99,8 +99,8 @@ class SceneFileError(ValueError):
 
 
 def from_file(path: Path) -> type[Experiment]:
-    """The one class derived from `Experiment` that a Python file defines. SceneFileError if there is not just one, if
-    the file cannot be run, or if an option has no default or an unknown type."""
+    """Return the one class derived from `Experiment` that a Python file defines. SceneFileError if there is not just
+    one, if the file cannot be run, or if an option has no default or an unknown type."""
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:

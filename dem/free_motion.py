@@ -175,10 +175,10 @@ def _spin_of(inertia, momentum, start, half):
         sine, versed = shares(rotation)
         if dot(change, change) <= 1e-16 * dot(start, start):
             break  # the next change would be its square
-    back = turned(momentum, rotation, -sine, versed)
-    error = plus(back, -1.0, _each(inertia, new))
+    in_frame = turned(momentum, rotation, -sine, versed)
+    error = plus(in_frame, -1.0, _each(inertia, new))
     found = dot(error, error) <= 1e-12 * dot(momentum, momentum)  # else a step does not resolve the motion
-    return (back[0] / inertia[0], back[1] / inertia[1], back[2] / inertia[2]), found
+    return (in_frame[0] / inertia[0], in_frame[1] / inertia[1], in_frame[2] / inertia[2]), found
 
 
 @loop

@@ -92,7 +92,7 @@ class Driven(Dynamic, Timed):
         most = self.strength(time, dt)
         return (most if self.speed is None else min(max(lack, -most), most)) * self.line
 
-    def grip(self, time: float, dt: float, mass: float, speed: float, lack: float) -> float:
+    def servo_inertia(self, time: float, dt: float, mass: float, speed: float, lack: float) -> float:
         """c dt of a servo [kg or kg m^2], for the mass or moment, and the `speed` before the step; else 0."""
         if self.speed is None:
             return 0.0
@@ -371,8 +371,8 @@ def top_speed(motion: Motion, position: Floats, reach: float) -> float:
     if isinstance(motion, Glide):
         return float(np.linalg.norm(motion.velocity))
     if isinstance(motion, Path):
-        ways = np.linalg.norm(np.diff(np.array(motion.positions), axis=0), axis=1)
-        return float((ways / np.diff(motion.times)).max(initial=0.0))
+        distances = np.linalg.norm(np.diff(np.array(motion.positions), axis=0), axis=1)
+        return float((distances / np.diff(motion.times)).max(initial=0.0))
     if isinstance(motion, Held):
         along, about = np.array([value or 0.0 for value in (*motion.velocity, *motion.angular_velocity)]).reshape(2, 3)
         return float(np.linalg.norm(along) + np.linalg.norm(about) * reach)

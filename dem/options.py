@@ -14,7 +14,7 @@ Check = Union[tuple[str, Callable[[Any], bool]], Callable[[str, Any], Any]]
 def option(
     default: Any, help: str, *, unit: str = "", choices: Iterable[str] = (), check: Check | None = None, name: str = ""
 ) -> Any:
-    """A dataclass field that is an option: its default, and its meaning, unit and choices, which `-help` shows.
+    """Return a dataclass field that is an option: its default, and its meaning, unit and choices, which `-help` shows.
 
     ``name`` is that of the option, if it is not the prefix of the group and the name of the field."""
     metadata = {"help": help, "unit": unit, "choices": tuple(choices), "check": check, "name": name}

@@ -12,7 +12,7 @@ from dem.arrays import Floats, Rule
 from dem.contact.broad import close_pairs
 from dem.geometry.insertion import inserted
 from dem.parts.cell import Cell
-from dem.parts.sources import Listed, Uniform
+from dem.parts.sizes import Listed, Uniform
 from dem.quaternion import length
 
 SPARSE = 0.1  #: solid fraction up to which spheres are put at random places one after another
@@ -21,8 +21,8 @@ TRIES = 100  #: places for a sphere
 
 
 def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -> Rule:
-    """Points (nx ny nz, 3) of the lattice with these coordinates per axis, each moved by up to `perturbation` [m] per
-    axis; z goes on from row to row."""
+    """Return points (nx ny nz, 3) of the lattice with these coordinates per axis, each moved by up to `perturbation`
+    [m] per axis; z goes on from row to row."""
     count = len(x) * len(y) * len(z)
     shift = uniform(-1.0, 1.0, (count, 3), seed)
 
@@ -34,8 +34,8 @@ def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -
 
 
 def uniform(low: float, high: float, shape: tuple[int, ...], seed: int) -> Rule:
-    """The array of this shape that `default_rng(seed).uniform` gives, of which any rows are made without the others: of
-    the generator PCG64 every number takes one step, and it can jump (`advance`)."""
+    """Return the array of this shape that `default_rng(seed).uniform` gives, of which any rows are made without the
+    others: of the generator PCG64 every number takes one step, and it can jump (`advance`)."""
     width = math.prod(shape[1:])
 
     def make(first: int, end: int) -> Floats:
@@ -54,8 +54,8 @@ def random_packing(
     seed: int = 0,
     most: int = 20000,
 ) -> tuple[Floats, Floats]:
-    """Centres (n, 3) and radii (n,) [m] of spheres without overlaps in the box from zero to the `lengths` (3,) [m],
-    with at least this solid `fraction`, up to about 0.6.
+    """Return centres (n, 3) and radii (n,) [m] of spheres without overlaps in the box from zero to the `lengths` (3,)
+    [m], with at least this solid `fraction`, up to about 0.6.
 
     Along `periodic` axes the box repeats itself; others have walls, which spheres do not cross. Spheres of a tenth of
     the volume are put at random places; then they grow from step to step, and what overlaps is pushed apart (Jodrey,
@@ -94,7 +94,7 @@ def _apart(position: Floats, radius: Floats, box: Floats, cell: Cell, most: int)
 
     Spheres that overlap are pushed apart by a part of the overlap, and go on for a part of the way of the last round.
     """
-    way = np.zeros_like(position)
+    displacement = np.zeros_like(position)
     for rounds in range(most, 0, -1):
         one, other, apart = _pairs(position, radius, cell)
         distance = length(apart)
@@ -107,8 +107,8 @@ def _apart(position: Floats, radius: Floats, box: Floats, cell: Cell, most: int)
         walls = np.where(cell.axes, 0.0, np.clip(position, radius[:, None], box - radius[:, None]) - position)
         if (deep < SWELL * reach / 2.0).all() and (np.abs(walls) < SWELL * radius[:, None] / 2.0).all():
             return position, rounds
-        way = 0.8 * way + 0.15 * (shift + 2.0 * walls)
-        position = cell.wrapped(position + way)
+        displacement = 0.8 * displacement + 0.15 * (shift + 2.0 * walls)
+        position = cell.wrapped(position + displacement)
     raise ValueError(f"a packing of {len(radius)} spheres still overlaps by {(deep / reach).max():.1e} of their size: "
                      "take a lower solid fraction")  # fmt: skip
 
@@ -116,8 +116,8 @@ def _apart(position: Floats, radius: Floats, box: Floats, cell: Cell, most: int)
 def _pairs(position: Floats, radius: Floats, cell: Cell) -> tuple[Floats, Floats, Floats]:
     """Rows (m,) and (m,) of spheres that touch, and the ways (m, 3) from the first to the second or its image."""
     source, moved, reach = [], [], 2.0 * radius.max()
-    for way in cell.image_vectors:  # the first are those in the box
-        image = position + way
+    for vector in cell.image_vectors:  # the first are those in the box
+        image = position + vector
         near = (((image > -reach) & (image < cell.period + reach)) | ~cell.axes).all(axis=1)
         source.append(np.flatnonzero(near))
         moved.append(image[near])

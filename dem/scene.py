@@ -35,7 +35,8 @@ from dem.parts.ends import End
 from dem.parts.joints import Joint
 from dem.parts.loads import Law, Load, On
 from dem.parts.named import Named
-from dem.parts.sources import Outlet, Passages, Source
+from dem.parts.passages import Outlet, Passages
+from dem.parts.sources import Source
 from dem.parts.springs import Spring
 from dem.quaternion import across, length
 from dem.shapes import Clump, Shape, clumps, convex, polyhedra
@@ -95,7 +96,7 @@ class Column:
     check: Callable[[str, ArrayLike], Floats]
 
     @classmethod
-    def of(
+    def checked(
         cls, name: str, values: ArrayLike, count: int, *row: int, check: Callable[..., Floats] = checks.finite
     ) -> Column:
         """ValueError for what is none; rows by a rule are checked when they are made."""
@@ -711,14 +712,15 @@ class Scene:
         if not isinstance(positions, Rule):
             positions = np.atleast_2d(checks.finite("positions", positions))
         count, first = len(positions), self.count
-        columns = [Column.of("positions", positions, count, 3)]
+        columns = [Column.checked("positions", positions, count, 3)]
         row = (3,) if kind == BOX else ()
-        columns += [Column.of(name, values, count, *row, check=checks.positive) for name, values in lengths.items()]
+        for name, values in lengths.items():
+            columns.append(Column.checked(name, values, count, *row, check=checks.positive))
         columns += [
-            Column.of("density", density, count, check=checks.positive),
-            Column.of("quaternions", quaternions, count, 4, check=checks.not_zero),
-            Column.of("velocity", velocity, count, 3),
-            Column.of("angular velocity", angular_velocity, count, 3),
+            Column.checked("density", density, count, check=checks.positive),
+            Column.checked("quaternions", quaternions, count, 4, check=checks.not_zero),
+            Column.checked("velocity", velocity, count, 3),
+            Column.checked("angular velocity", angular_velocity, count, 3),
         ]
         given = {column.name: column for column in columns}
         if not isinstance(material, str) and len(material) != count:
@@ -799,11 +801,11 @@ def _turning(body: LargeBody, motion: Dynamic) -> LargeBody:
     if np.trace(turns) > 1.5:
         return body
     axis = motion.line if isinstance(motion, Hinged) else np.diag(turns)
-    back = quaternion.conjugate(body.quaternion)
-    moment = float(body.inertia @ quaternion.rotate(back, axis) ** 2)
+    inverse_turn = quaternion.conjugate(body.quaternion)
+    moment = float(body.inertia @ quaternion.rotate(inverse_turn, axis) ** 2)
     x = across(axis[None])[0]
     upright = quaternion.from_matrix(np.stack([x, np.cross(axis, x), axis], axis=1))
-    turned = _reframed(body, np.zeros(3), quaternion.multiply(back, upright))
+    turned = _reframed(body, np.zeros(3), quaternion.multiply(inverse_turn, upright))
     return replace(turned, quaternion=upright, inertia=np.array([np.inf, np.inf, moment]))
 
 

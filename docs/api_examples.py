@@ -117,7 +117,7 @@ scene.add_spheres(points[points[:, 0] > 0.5], 0.05, 2500.0, material="right")
 sim = pctt.Simulation(scene, dt=0.001)
 sim.step()
 sample = sim.sample
-mixing = measures.mixing(sample, sample.of("left"), measures.Block((0, 0, 0), (1, 1, 1)), (4, 4, 4))
+mixing = measures.mixing(sample, sample.of_material("left"), measures.Block((0, 0, 0), (1, 1, 1)), (4, 4, 4))
 print("two halves apart: Lacey's index", mixing.lacey, "segregation", mixing.intensity)
 
 # %% dem.measures.Profile
@@ -374,7 +374,7 @@ sim.run(until=1.0)
 shoulder = sim.joint("shoulder")
 print(f"angle {shoulder.angle:.3f} rad after 1 s at 0.5 rad/s, torque of the motor {shoulder.drive:.2f} N m")
 
-# %% dem.parts.sources.Source, dem.parts.sources.Outlet, dem.parts.sources.Tally, dem.parts.sources.Passages
+# %% dem.parts.sources.Source, dem.parts.sources.Tally, dem.parts.passages.Outlet, dem.parts.passages.Passages
 import pctt
 from dem.measures import Block
 from dem.scene import Scene
@@ -388,8 +388,8 @@ sim.run(until=1.0)
 print(sim.source("feed").count, "came,", sim.outlet("drain").count, "left,", len(sim.ids), "are there")
 print("counted are", ", ".join(sim.world.passages.names))
 
-# %% dem.parts.sources.Uniform, dem.parts.sources.Listed
-from dem.parts.sources import Listed, Uniform
+# %% dem.parts.sizes.Uniform, dem.parts.sizes.Listed
+from dem.parts.sizes import Listed, Uniform
 
 print("between", Uniform(0.01, 0.02).ends)
 sizes = Listed([0.01, 0.03], shares=[0.9, 0.1])  # a tenth of the grains is large

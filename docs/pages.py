@@ -33,8 +33,8 @@ PARTS = {
     "Simulations and their results": ["pctt", "pctt.simulation", "pctt.folder", "pctt.analysis", "dem.measures"],
     "What a scene is made of": [
         "dem.scene", "dem.shapes", "dem.mesh", "dem.motion", "dem.parts.contact_law", "dem.parts.loads",
-        "dem.parts.springs", "dem.parts.joints", "dem.parts.sources", "dem.parts.cell", "dem.packing", "pctt.beds",
-        "dem.experiment",
+        "dem.parts.springs", "dem.parts.joints", "dem.parts.sources", "dem.parts.passages", "dem.parts.cell",
+        "dem.parts.sizes", "dem.packing", "pctt.beds", "dem.experiment",
         "pctt.scenes", "dem.start.stiffness", "dem.start.time_step", "dem.checks", "dem.record.analysis",
     ],
     "What a time step is made of": [

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from dem.motion import Rotation as Rotation
     from dem.packing import perturbed as perturbed
     from dem.packing import random_packing as random_packing
-    from dem.parts.sources import Uniform as Uniform
+    from dem.parts.sizes import Uniform as Uniform
     from dem.scene import Scene as Scene
     from dem.shapes import Box as Box
     from dem.shapes import Capsule as Capsule
@@ -58,7 +58,7 @@ _HOMES = {
     "dem.mesh": "Mesh",
     "dem.motion": "Dynamic Fixed Glide Guided Held Hinged Oscillation Path Rotation",
     "dem.packing": "perturbed random_packing",
-    "dem.parts.sources": "Uniform",
+    "dem.parts.sizes": "Uniform",
     "dem.scene": "Scene",
     "dem.shapes": "Box Capsule Clump Plane Sphere",
     "pctt.beds": "read_spheres",

@@ -27,7 +27,7 @@ from pctt.folder import Folder
 
 
 def sample(folder: Folder, step: int) -> Sample:
-    """All grains and contacts of a recorded step. FileError if there is no such step, or if its file is damaged.
+    """Return all grains and contacts of a recorded step. FileError if there is no such step, or if its file is damaged.
 
     The centres at the start of the step are those of the record less dt times the velocities; that is exact but for
     bodies with a prescribed motion that turns. A cell that deforms is taken back with them."""
@@ -67,12 +67,12 @@ def sample(folder: Folder, step: int) -> Sample:
 
 
 def fields(folder: Folder, step: int, *given: Any, **more: Any) -> Fields:
-    """Coarse-grained fields of a recorded step; the other arguments are those of `dem.measures.fields`."""
+    """Return coarse-grained fields of a recorded step; the other arguments are those of `dem.measures.fields`."""
     return measures.fields(sample(folder, step), *given, **more)
 
 
 def triangle_forces(folder: Folder, step: int, name: str) -> Floats:
-    """Forces (triangles, 3) [N] on the triangles of the large body of this name, which is one mesh, as
+    """Return forces (triangles, 3) [N] on the triangles of the large body of this name, which is one mesh, as
     `dem.measures.triangle_forces`. ValueError for another body."""
     found, names = sample(folder, step), [body["name"] for body in folder.large]
     if name not in names:

@@ -227,7 +227,7 @@ def write_vtkhdf(path: Path, name: str, scene: Any, steps: list[int]) -> None:
 
     points: dict[int, int] = {}
 
-    class Source(VTKPythonAlgorithmBase):
+    class PolyDataSource(VTKPythonAlgorithmBase):
         """The steps as a series that VTK asks for by time; here the number of the step is the time."""
 
         def RequestInformation(self, _request: Any, _inputs: Any, outputs: Any) -> int:
@@ -242,7 +242,7 @@ def write_vtkhdf(path: Path, name: str, scene: Any, steps: list[int]) -> None:
             outputs.GetInformationObject(0).Get(data.DATA_OBJECT()).ShallowCopy(data)
             return 1
 
-    source = Source(nInputPorts=0, outputType="vtkPolyData")
+    source = PolyDataSource(nInputPorts=0, outputType="vtkPolyData")
     writer = vtkHDFWriter(write_all_time_steps=True, chunk_size=1000)
     writer.SetInputConnection(source.GetOutputPort())
     with whole(path) as temporary:

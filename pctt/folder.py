@@ -65,7 +65,7 @@ LINKS = (
 
 
 def dumps(figures: Any, indent: int | None = None) -> str:
-    """The JSON text of figures: numbers, and dicts and lists of them."""
+    """Return the JSON text of figures: numbers, and dicts and lists of them."""
     def text(figures: Any) -> str:
         return json.dumps(figures, indent=indent, allow_nan=False, default=lambda number: number.item())  # of numpy
 
@@ -76,7 +76,7 @@ def dumps(figures: Any, indent: int | None = None) -> str:
 
 
 def loads(line: str) -> dict[str, Any]:
-    """The figures of a JSON text by name; null becomes infinity. ValueError if the text is not JSON."""
+    """Return the figures of a JSON text by name; null becomes infinity. ValueError if the text is not JSON."""
     return {name: math.inf if value is None else value for name, value in json.loads(line).items()}
 
 
@@ -89,7 +89,7 @@ def _finite(value: Any) -> Any:
 
 
 def totals(steps: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The figures of a whole run, from those of its steps; nothing of no steps."""
+    """Return the figures of a whole run, from those of its steps; nothing of no steps."""
     if not steps:
         return {}
     worst = max(steps, key=lambda line: line["worst_overlap"])

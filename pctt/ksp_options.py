@@ -45,11 +45,11 @@ _NO_PREFIX = {"compare_every"}  # an option of the program that begins like thos
 
 @contextmanager
 def entered(
-    options: Mapping[str, str | None], sources: Mapping[str, str] | None = None, hidden: Iterable[str] = ()
+    options: Mapping[str, str | None], origins: Mapping[str, str] | None = None, hidden: Iterable[str] = ()
 ) -> Iterator[None]:
     """Put these options into the database within the block; afterwards it has the user's options again.
 
-    ``sources`` are the user's options from which some were made, by their names: those are used when these are. The
+    ``origins`` are the user's options from which some were made, by their names: those are used when these are. The
     options ``hidden`` are not there within the block.
     """
     database = PETSc.Options()
@@ -67,7 +67,7 @@ def entered(
             database.delValue(name)
         for name, value in users.items():
             database[name] = value
-        used |= {source for name, source in (sources or {}).items() if name in used}
+        used |= {source for name, source in (origins or {}).items() if name in used}
         mark_used(used & options_database().keys())
 
 
@@ -98,7 +98,7 @@ def unused(names: Iterable[str]) -> list[str]:
 
 
 def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> tuple[dict[str, str | None], dict[str, str]]:
-    """The options to enter for a KSP with this prefix, and their sources (`entered`).
+    """The options to enter for a KSP with this prefix, and their origins (`entered`).
 
     They are the defaults of options that the user has not given; before these, a KSP with another prefix than `OWN` has
     the ``ksp_`` options of that one. Factorisations are those of MUMPS if PETSc has it: its own have natural orders and
@@ -109,8 +109,8 @@ def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> tuple[dict
     of_main = [name for name in given if name.startswith(f"{OWN}ksp_") and prefix != OWN]
     shared = {prefix + name[len(OWN) :]: name for name in of_main}
     ours = {prefix + name: value for name, value in defaults.items() if prefix + name not in given}
-    sources = {name: source for name, source in shared.items() if name not in given and name not in ours}
-    options: dict[str, str | None] = {**ours, **{name: given[source] for name, source in sources.items()}}
+    origins = {name: source for name, source in shared.items() if name not in given and name not in ours}
+    options: dict[str, str | None] = {**ours, **{name: given[source] for name, source in origins.items()}}
     everything = {**given, **options}
     kind, solver = everything.get(prefix + "pc_type"), prefix + "pc_factor_mat_solver_type"
     if kind in ("cholesky", "lu") and solver not in everything and PETSc.Sys.hasExternalPackage("mumps"):
@@ -122,8 +122,8 @@ def to_enter(prefix: str, defaults: Mapping[str, str], ranks: int) -> tuple[dict
         start = f"{prefix}pc_factor_"
         factor = {f"{prefix}sub_{name[len(prefix):]}": name for name in everything if name.startswith(start)}
         options |= {name: everything[source] for name, source in factor.items()}
-        sources |= factor
-    return options, sources
+        origins |= factor
+    return options, origins
 
 
 # -- the options of the program --------------------------------------------------------------------------------------
@@ -149,9 +149,9 @@ def solver_options(database: Mapping[str, str | None]) -> dict[str, str]:
 def taken_over(database: Mapping[str, str | None]) -> Iterator[None]:
     """Within the block the options of solvers without prefix are also those of the project's KSPs. An OptionError names
     an option as it is spelt in the database."""
-    sources = {OWN + short: spelt for short, spelt in solver_options(database).items()}
+    origins = {OWN + short: spelt for short, spelt in solver_options(database).items()}
     try:
-        with entered({name: database[spelt] for name, spelt in sources.items()}, sources):
+        with entered({name: database[spelt] for name, spelt in origins.items()}, origins):
             yield
     except OptionError as error:
         starts = "|".join(OF_SOLVERS)

@@ -26,7 +26,8 @@ class OptionError(ValueError):
 
 
 def number(default: Any, why: str) -> Any:
-    """A dataclass field that steers a method and is set from Python only; ``why`` is its derivation or measurement."""
+    """Return a dataclass field that steers a method and is set from Python only; ``why`` is its derivation or
+    measurement."""
     return dataclasses.field(default=default, metadata={"help": why, "python_only": True})
 
 
@@ -62,7 +63,7 @@ class Description:
 
 
 def describe(group: type, prefix: str = "") -> list[Description]:
-    """The options of a group, in the order of its fields, which may be plain ones of a user's scene."""
+    """Return the options of a group, in the order of its fields, which may be plain ones of a user's scene."""
     shown = ("unit", "help", "choices")
     return [
         Description(name, f.default, **{key: f.metadata[key] for key in shown if key in f.metadata})
@@ -71,7 +72,7 @@ def describe(group: type, prefix: str = "") -> list[Description]:
 
 
 def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "") -> Group:
-    """A group with the values in the database; raises OptionError for a bad value.
+    """Return a group with the values in the database; raises OptionError for a bad value.
 
     ``database`` maps names without the dash to strings, as `pctt.petsc.options_database` does.
     """
@@ -88,7 +89,8 @@ def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "
 
 
 def made(group: type[Group], values: Mapping[str, Any]) -> Group:
-    """A group with these values of fields, of the right types or not; OptionError for a name that it does not have."""
+    """Return a group with these values of fields, of the right types or not; OptionError for a name that it does not
+    have."""
     known = [f.name for f in dataclasses.fields(group)]  # type: ignore[arg-type]
     for name in values:
         if name not in known:
@@ -104,7 +106,7 @@ def _of_meaning(group: Any, words: str) -> str:
 
 
 def refuse_bad(group: Any) -> None:
-    """OptionError for a value of a group, made in Python, that `read` would refuse, or that has another type."""
+    """Raise OptionError for a value of a group, made in Python, that `read` would refuse, or that has another type."""
     kinds = _hints(type(group))
     for f in dataclasses.fields(group):
         value, kind = getattr(group, f.name), _kind(kinds[f.name])
@@ -153,5 +155,5 @@ def _truth(text: str) -> bool:
 
 
 def no_such_option(name: str, known: Iterable[str]) -> OptionError:
-    """The error for an unknown name; its message has the nearest known name."""
+    """Return the error for an unknown name; its message has the nearest known name."""
     return OptionError(f"-{name}: no such option{nearest(name, known, '-', 0.5) or '; -help lists the options'}")

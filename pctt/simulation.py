@@ -106,7 +106,7 @@ class Simulation:
         self._compare = compare or ccp.Comparison(comm, [])
         compared = bool(self._compare.names)
         self.settings = together(
-            comm, "settings", lambda: made(Settings, given).of(self.experiment, compared), own=(OptionError,)
+            comm, "settings", lambda: made(Settings, given).completed_for(self.experiment, compared), own=(OptionError,)
         )
         scene = state.built(self.experiment, comm)
         self.dt_reason = reason(scene) if self.settings.dt is None else ""
@@ -258,8 +258,8 @@ class Simulation:
         if until is not None:
             left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
         first, end, ends = self.steps, self.steps + left, False
-        told = report.Progress(self.comm, quiet=not progress)
-        told.passed(first, self.time, end)
+        progress_report = report.Progress(self.comm, quiet=not progress)
+        progress_report.passed(first, self.time, end)
 
         def tell() -> bool:
             if call is not None and (self.steps - first) % every == 0:
@@ -272,7 +272,7 @@ class Simulation:
                 ends = tell()
             elif call or stop:  # an error of one rank is one of all, and the first rank decides
                 ends = self.comm.bcast(together(self.comm, "call or stop of run", tell))
-            told.passed(self.steps, self.time, self.steps if ends else end)
+            progress_report.passed(self.steps, self.time, self.steps if ends else end)
         self.complete()
 
     # -- what there is ---------------------------------------------------------------------------------------
@@ -286,7 +286,7 @@ class Simulation:
     def expected_overlap(self) -> float:
         """The greatest to expect of the contacts as springs, as a part of a half thickness; 0 of rigid contacts. Not
         collective."""
-        return self.overlap_watch.springs
+        return self.overlap_watch.elastic
 
     @property
     def steps(self) -> int:

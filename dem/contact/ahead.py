@@ -86,12 +86,12 @@ def seen_from(
     from the bodies of their hosts, the rows j (m,), put back to where these are now; and how far the surfaces of the
     two go along each other until then (m,), at most. `inner` is that of `dem.contact.polyhedra.Hulls`."""
     (place, velocity, _, _), (center, quaternion), row = course, poses, forms[1]
-    middle, turn, way = np.empty((len(i), 3)), np.empty((len(i), 4)), np.empty(len(i))
+    middle, turn, travel = np.empty((len(i), 3)), np.empty((len(i), 4)), np.empty(len(i))
     for p in range(len(i)):
         a, b = i[p], j[p]
         A, B = row[a], row[b]
         h, speed = ahead_by(a, b, forms, poses, inner, course)
-        u, w, way[p] = vector_of(velocity[A], 3), vector_of(velocity[B], 3), h * speed
+        u, w, travel[p] = vector_of(velocity[A], 3), vector_of(velocity[B], 3), h * speed
         far = plus(vector_of(place[A], 0), h, vector_of(velocity[A], 0))
         far = plus(far, 1.0, after_turn(plus(center[a], -1.0, place[A]), u, h))
         far = after_turn(plus(plus(far, -h, vector_of(velocity[B], 0)), -1.0, place[B]), w, -h)
@@ -100,7 +100,7 @@ def seen_from(
             middle[p, k] = place[B, k] + far[k]
         for k in range(4):
             turn[p, k] = q[k]
-    return middle, turn, way
+    return middle, turn, travel
 
 
 @loop
@@ -205,8 +205,8 @@ def _from_host(end, kind, quaternion, size, radius, spin, time):
         x, y, z = after_turn((-size[0], -size[1], -size[2]), spin, time)
         gap = -(x * end[0] + y * end[1] + z * end[2]) - radius
     else:
-        back = after_turn(end, spin, -time)
-        x, y, z, gap = to_box(back[0], back[1], back[2], radius, frame_of(quaternion), size)
+        local = after_turn(end, spin, -time)
+        x, y, z, gap = to_box(local[0], local[1], local[2], radius, frame_of(quaternion), size)
         x, y, z = after_turn((x, y, z), spin, time)
     return (x, y, z), gap
 

@@ -19,8 +19,8 @@ def close_pairs(position: Floats, radius: Floats) -> Ints:
     pairs = [np.zeros((0, 2), np.int64)]
     for k, rows in enumerate(classes):
         for others in classes[k:]:
-            few, many = sorted((rows, others), key=len)
-            pairs.append(pairs_in_cells(position, radius, few, many, others is rows))
+            fewer, more = sorted((rows, others), key=len)
+            pairs.append(pairs_in_cells(position, radius, fewer, more, others is rows))
     return np.concatenate(pairs)
 
 

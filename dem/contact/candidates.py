@@ -25,7 +25,7 @@ Parts = tuple[Ints, Ints, Floats]
 
 #: Of large bodies the pivots (bodies, 3), the shifts (k, bodies, 6) by which they may move and turn, which of them
 #: (bodies,) have surfaces that go further than their margins, and these (bodies,).
-Ways = tuple[Floats, Floats, Bools, Floats]
+Travels = tuple[Floats, Floats, Bools, Floats]
 
 
 def meeting(
@@ -56,14 +56,15 @@ def _of_images(near: Neighbourhood, wanted: Bools, table: Primitives, delta: flo
     first, image = near.grains + near.ghosts, near.grains + np.flatnonzero(wanted)
     count = len(image)
     bodies_of = np.concatenate([image, np.arange(first, len(near.bodies))])
-    alone = Neighbourhood(near.bodies.take(bodies_of), near.margin[image], near.index[bodies_of], count, 0)
+    image_bodies = Neighbourhood(near.bodies.take(bodies_of), near.margin[image], near.index[bodies_of], count, 0)
     rows = np.concatenate([image, np.arange(first, len(table.kind))])
     names = ("number", "kind", "center", "quaternion", "size", "radius")
     columns = {name: getattr(table, name)[rows] for name in names}
     row = np.concatenate([np.arange(count), table.row[first:] - first + count])
     none = Rows(np.zeros(count + 1, np.int64), np.zeros(0, np.int64))
     solid = table.kind[first:] != PLANE
-    found = _of_grains(alone, none, solid, table._replace(row=row, **columns), delta, shifts, np.ones(count, bool))
+    given = none, solid, table._replace(row=row, **columns), delta, shifts, np.ones(count, bool)
+    found = _of_grains(image_bodies, *given)
     return rows[found[0]], rows[found[1]], found[2]
 
 
@@ -75,9 +76,9 @@ def _of_grains(
     first = near.grains + near.ghosts
     part = first + wanted.nonzero()[0]
     turn = quaternion.matrix(table.quaternion[part]).reshape(-1, 9)
-    turning, way = shifts[:, :, 3:].any(axis=(0, 2)), length(shifts[:, :, :3]).max(axis=0)
+    turning, travel = shifts[:, :, 3:].any(axis=(0, 2)), length(shifts[:, :, :3]).max(axis=0)
     grains, parts = (rows.start, rows.other, near.margin, grown), (part, table.row[part] - first, turn)
-    least = np.maximum(0.5 * delta, np.where(turning, 0.0, way))
+    least = np.maximum(0.5 * delta, np.where(turning, 0.0, travel))
     given = grains, parts, (near.bodies.position[first:], shifts, turning, least)
     shapes = table.kind, table.center, table.size, table.radius
     done, found, room = 0, 0, len(rows.other) + near.grains + len(part)
@@ -93,14 +94,14 @@ def _of_grains(
 
 @loop
 def fill(
-    grains: Grains, parts: Parts, ways: Ways, shapes: tuple[Ints, Floats, Floats, Floats], number: Ints, done: int,
-    found: int, out: Pairs,
+    grains: Grains, parts: Parts, travels: Travels, shapes: tuple[Ints, Floats, Floats, Floats], number: Ints,
+    done: int, found: int, out: Pairs,
 ) -> tuple[int, int]:  # fmt: skip
     """Add to the first pairs of `out` those of the grains that are not done, as long as there is room; new numbers of
     grains done and pairs found."""
     start, other, margin, grown = grains
     part, body, turn = parts
-    pivot, shifts, turning, least = ways
+    pivot, shifts, turning, least = travels
     kind, center, size, radius = shapes
     i, j, reach = out
     for n in range(done, len(start) - 1):
@@ -121,7 +122,7 @@ def fill(
         for k in range(len(part) if grown[n] else 0):
             if body[k] != last:
                 last = body[k]
-                way = least[last]
+                travel = least[last]
                 if turning[last]:
                     u, v, w = x - pivot[last, 0], y - pivot[last, 1], z - pivot[last, 2]
                     for s in range(len(shifts)):
@@ -129,8 +130,8 @@ def fill(
                         a = shifts[s, last, 0] + q * w - r * v
                         b = shifts[s, last, 1] + r * u - p * w
                         c = shifts[s, last, 2] + p * v - q * u
-                        way = max(way, np.sqrt(a * a + b * b + c * c) + wide * np.sqrt(p * p + q * q + r * r))
-                limit = own + way
+                        travel = max(travel, np.sqrt(a * a + b * b + c * c) + wide * np.sqrt(p * p + q * q + r * r))
+                limit = own + travel
             m, far = part[k], wide * (1.0 + 1e-9) + limit  # where rounding matters, the narrow phase is to decide
             u, v, w = x - center[m, 0], y - center[m, 1], z - center[m, 2]
             if kind[m] == PLANE:
@@ -178,5 +179,5 @@ def _part_margin(shifts: Floats, pivot: Floats, center: Floats, radius: Floats, 
     """Margins (m,) of the parts of large bodies at the surfaces of primitives of centres (m, 3) and radii (m,) [m]. The
     bodies move and turn, about the pivots (m, 3), by any of the `shifts` (k, m, 6)."""
     move, turn = shifts[..., :3], shifts[..., 3:]
-    way = length(move + cross(turn, center - pivot)) + radius * length(turn)
-    return np.maximum(delta / 2, way.max(axis=0))
+    travel = length(move + cross(turn, center - pivot)) + radius * length(turn)
+    return np.maximum(delta / 2, travel.max(axis=0))

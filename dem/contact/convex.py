@@ -135,7 +135,7 @@ def solids(kind: Ints, center: Floats, turn: Floats, size: Floats, hulls: Hulls,
 def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) -> Manifold:
     """Contacts of gap at most `delta` (m,) [m], all with the same normal."""
     done, found, room = 0, 0, 4 * len(delta) + POINTS
-    given, contacts = (*first.tables(), *second.tables(), *_tables(hulls), delta), ContactBuffer.of(room)
+    given, contacts = (*first.tables(), *second.tables(), *_tables(hulls), delta), ContactBuffer.with_room(room)
     while True:
         done, found = _pairs(*given, (done, found), contacts[:])
         if done == len(delta):
@@ -145,7 +145,7 @@ def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) ->
 
 def solids_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> Manifold:
     """What of the body lies flush along the plane: the points of a face or a side, and the support."""
-    contacts, (outward, origin) = ContactBuffer.of(len(delta) * POINTS), map(np.ascontiguousarray, plane)
+    contacts, (outward, origin) = ContactBuffer.with_room(len(delta) * POINTS), map(np.ascontiguousarray, plane)
     given = *body.tables(), *_tables(hulls), (outward, origin), delta
     return contacts.manifold(_planes(*given, contacts[:]))
 

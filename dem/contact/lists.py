@@ -64,16 +64,16 @@ class Lists:
         return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
 
 
-def grain_lists(world: World, last: Lists | None, margin: Floats, way: Floats) -> Lists:
+def grain_lists(world: World, last: Lists | None, margin: Floats, travel: Floats) -> Lists:
     """The lists of an earlier search if they hold for the margins (grains,) [m], else new ones for grains that go the
-    `way` (grains,) [m] in a step; collective."""
+    `travel` (grains,) [m] in a step; collective."""
     holds = last is not None and last.hold(world, margin)
-    return _new_lists(world, margin, way) if on_any(world.comm, not holds)[0] or last is None else last
+    return _new_lists(world, margin, travel) if on_any(world.comm, not holds)[0] or last is None else last
 
 
-def _new_lists(world: World, margin: Floats, way: Floats) -> Lists:
+def _new_lists(world: World, margin: Floats, travel: Floats) -> Lists:
     size = bodies.bounding_radius(world.grains)
-    near = neighbourhood(world, margin + np.minimum(AT_REST * size + STEPS * way, size))
+    near = neighbourhood(world, margin + np.minimum(AT_REST * size + STEPS * travel, size))
     grains, count = near.grains, near.grains + near.ghosts
     pictures = images(world, near)
     wide = pictures.among(near)

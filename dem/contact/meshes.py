@@ -130,8 +130,8 @@ def _within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, s
     rim = np.flatnonzero(feature >= len(surface.triangle))
     start, vertex = surface.around
     row, entry = spread(start, feature[rim] - len(surface.triangle))
-    way = surface.vertex[vertex[entry]] - point[rim[row]]
-    inside[rim[row[dot(way, away[rim[row]]) > slack * length(way)]]] = False
+    offset = surface.vertex[vertex[entry]] - point[rim[row]]
+    inside[rim[row[dot(offset, away[rim[row]]) > slack * length(offset)]]] = False
     return inside
 
 

@@ -86,7 +86,7 @@ class ContactBuffer(NamedTuple):
     out: Floats  #: (room, 7) points, normals and gaps
 
     @classmethod
-    def of(cls, room: int) -> ContactBuffer:
+    def with_room(cls, room: int) -> ContactBuffer:
         """Room for so many."""
         return cls(np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7)))
 
@@ -212,10 +212,10 @@ def capsule_box(capsule: Capsules, box: Boxes, delta: Floats) -> Manifold:
     rows = np.arange(len(center))
     middle = ((center - box.center)[:, None, :] @ turn)[:, 0]
     reach = half_length[:, None] * (axis[:, None, :] @ turn)[:, 0]
-    start, way = middle - reach, 2.0 * reach  # of the core, in the frame of the box
+    start, segment = middle - reach, 2.0 * reach  # of the core, in the frame of the box
 
-    low = np.minimum(start, start + way)
-    apart = np.concatenate([low - half, -(low + np.abs(way)) - half], axis=1)  # of the six faces
+    low = np.minimum(start, start + segment)
+    apart = np.concatenate([low - half, -(low + np.abs(segment)) - half], axis=1)  # of the six faces
     slack = SNAP * (half_length + half.min(axis=1))
     face = (apart >= apart.max(axis=1, keepdims=True) - SNAP * slack[:, None]).argmax(axis=1)
     k, sign = face % 3, np.where(face < 3, 1.0, -1.0)
@@ -224,17 +224,17 @@ def capsule_box(capsule: Capsules, box: Boxes, delta: Floats) -> Manifold:
         """At shares (m,) of the way from the start of the core to its end."""
         return Spheres(center + ((2.0 * share - 1.0) * half_length)[:, None] * axis, radius)
 
-    closest = sphere_box(ball(_closest_to_box(start, way, half)), box)
+    closest = sphere_box(ball(_closest_to_box(start, segment, half)), box)
 
     # The stretch of the core over the face: clipped with the slabs of the two other axes.
-    enter, leave = _slabs(start, way, half + slack[:, None])
+    enter, leave = _slabs(start, segment, half + slack[:, None])
     enter[rows, k], leave[rows, k] = 0.0, 1.0
     begin, end = np.maximum(enter.max(axis=1), 0.0), np.minimum(leave.min(axis=1), 1.0)
     over = begin <= end
     normal = -sign[:, None] * turn[rows, :, k]
     stretch = []
     for place in (np.where(over, begin, 0.0), np.where(over, end, 0.0)):
-        gap = sign * (start[rows, k] + place * way[rows, k]) - half[rows, k] - radius
+        gap = sign * (start[rows, k] + place * segment[rows, k]) - half[rows, k] - radius
         stretch.append(Touch(ball(place).center + (radius + 0.5 * gap)[:, None] * normal, normal, gap))
     lowest = np.where(over, np.minimum(stretch[0].gap, stretch[1].gap), np.inf)
     meets = over & (closest.gap <= -radius)
@@ -266,17 +266,17 @@ def _crossing(first: Capsules, second: Capsules) -> Touch:
     return Touch(center + np.where(inside, s, 0.0)[:, None] * axis + ahead[:, None] * normal, normal, gap)
 
 
-def _slabs(start: Floats, way: Floats, half: Floats) -> tuple[Floats, Floats]:
+def _slabs(start: Floats, segment: Floats, half: Floats) -> tuple[Floats, Floats]:
     """Parameters t (m, 3) between which the coordinates of start + t way (m, 3) stay within +-half (m, 3), each; the
     first is the greater where one never does."""
-    moving = np.abs(way) > 1e-12 * half
-    divisor = np.where(moving, way, 1.0)
+    moving = np.abs(segment) > 1e-12 * half
+    divisor = np.where(moving, segment, 1.0)
     one, two = (-half - start) / divisor, (half - start) / divisor
     outside = np.where(np.abs(start) <= half, -np.inf, np.inf)
     return np.where(moving, np.minimum(one, two), outside), np.where(moving, np.maximum(one, two), -outside)
 
 
-def _closest_to_box(start: Floats, way: Floats, half: Floats) -> Floats:
+def _closest_to_box(start: Floats, segment: Floats, half: Floats) -> Floats:
     """Parameters t in [0, 1] (m,) of the points of segments start + t way (m, 3) that are closest to boxes about the
     origin.
 
@@ -284,10 +284,10 @@ def _closest_to_box(start: Floats, way: Floats, half: Floats) -> Floats:
     crosses the planes of the faces: the root is found exactly.
     """
     ends = np.tile([0.0, 1.0], (len(start), 1))
-    t = np.sort(np.clip(np.concatenate([ends, *_slabs(start, way, half)], axis=1), 0.0, 1.0), axis=1)
-    place = start[:, None, :] + t[:, :, None] * way[:, None, :]
+    t = np.sort(np.clip(np.concatenate([ends, *_slabs(start, segment, half)], axis=1), 0.0, 1.0), axis=1)
+    place = start[:, None, :] + t[:, :, None] * segment[:, None, :]
     beyond = place - np.clip(place, -half[:, None], half[:, None])
-    slope = dot(beyond, way[:, None, :])
+    slope = dot(beyond, segment[:, None, :])
     rows, last = np.arange(len(t)), t.shape[1] - 1
     after = np.clip((slope <= 0.0).sum(axis=1), 1, last)  # the first crossing at which the distance grows
     before = after - 1

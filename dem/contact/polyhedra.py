@@ -142,7 +142,7 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
     """
     most = 4 * first.hulls.corner.shape[2] + 2 * first.hulls.vertex.shape[1]
     done, found, room = 0, 0, 4 * len(delta) + most
-    given, contacts = (*first.hulls.tables(), first.columns(), second.columns(), delta), ContactBuffer.of(room)
+    given, contacts = (*first.hulls.tables(), first.columns(), second.columns(), delta), ContactBuffer.with_room(room)
     while True:
         done, found = _pairs(*given, most, (done, found), contacts[:])
         if done == len(delta):
@@ -152,14 +152,14 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
 
 def spheres_polyhedra(ball: Spheres, body: Polyhedra, delta: Floats) -> Manifold:
     """One contact, at the closest point; a centre inside is pushed out through the nearest face."""
-    contacts, hulls = ContactBuffer.of(len(delta)), body.hulls
+    contacts, hulls = ContactBuffer.with_room(len(delta)), body.hulls
     given = ball[:], hulls.tables()[0], hulls.corner, body.columns(), delta
     return contacts.manifold(_spheres(*given, contacts[:]))
 
 
 def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
     """The corners."""
-    contacts = ContactBuffer.of(len(delta) * body.hulls.vertex.shape[1])
+    contacts = ContactBuffer.with_room(len(delta) * body.hulls.vertex.shape[1])
     return contacts.manifold(_planes(body.hulls.tables()[0], body.columns(), plane[:], delta, contacts[:]))
 
 
@@ -775,11 +775,11 @@ def _each_once(out, feature, start, own, found, close):
     """Leave out the contacts from `own` on that are in the place of one from `start` on; the new number of contacts."""
     to = own
     for k in range(own, found):
-        alone = True
+        is_new = True
         for n in range(start, own):
             x, y, z = out[k, 0] - out[n, 0], out[k, 1] - out[n, 1], out[k, 2] - out[n, 2]
-            alone &= x * x + y * y + z * z > close * close
-        if alone:
+            is_new &= x * x + y * y + z * z > close * close
+        if is_new:
             out[to], feature[to] = out[k], feature[k]
             to += 1
     return to

@@ -247,8 +247,8 @@ def _touching(
     contacts, first, second = _TOUCH[kinds]
     guests = table.take(i)
     if course is not None:
-        center, turn, way = seen_from(*table.tables(), course[:], i, j)
-        guests, delta = guests._replace(center=center, quaternion=turn), delta + way
+        center, turn, travel = seen_from(*table.tables(), course[:], i, j)
+        guests, delta = guests._replace(center=center, quaternion=turn), delta + travel
     if second is not None:
         further = (table.hulls,) if first is Primitives.solid or second is Primitives.solid else ()
         return contacts(first(guests, slice(None)), second(table, j), delta, *further)

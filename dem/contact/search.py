@@ -82,8 +82,8 @@ class Contacts:
 
     def branch(self, position: Floats) -> Floats:
         """From the centre of body a to that of body b, or of its image (nc, 3), at these positions (rows, 3) [m]."""
-        way = position[self.b] - position[self.a]
-        return way if self.moved is None else way + self.moved
+        branch = position[self.b] - position[self.a]
+        return branch if self.moved is None else branch + self.moved
 
     def flow(self, cell: Cell, position: Floats) -> Floats | None:
         """What the cell adds to the velocities of b relative to a (nc, 3) in a step from these positions (rows, 3), by
@@ -102,7 +102,7 @@ def find_contacts(
     world: World, delta: float, free: UnconstrainedMotion | None = None, margin: Floats | float = 0.0,
     shifts: Floats | None = None, lists: Lists | None = None, besides: Contacts | None = None,
 ) -> Contacts:  # fmt: skip
-    """All contacts that this rank owns of the pairs whose margins meet; collective.
+    """Return all contacts that this rank owns of the pairs whose margins meet; collective.
 
     The margin of a body is delta/2 [m], or the way that it goes in a step of the motion `free` without contacts, of a
     grain FURTHER times that, if it is longer; None: where bodies are, not where they will be. So a gap of at most
@@ -113,9 +113,9 @@ def find_contacts(
     contacts that a search with margins not greater has found, only those are found that are not among them.
     """
     not_negative("contact distance delta", delta)
-    margin, way, shifts = _margins(world, delta, free, margin, shifts)
+    margin, travel, shifts = _margins(world, delta, free, margin, shifts)
     refuse_short(world, margin)
-    lists = grain_lists(world, world.lists if lists is None else lists, margin, way)
+    lists = grain_lists(world, world.lists if lists is None else lists, margin, travel)
     base, images = refreshed(lists.near, lists.halo, world, margin), lists.images.now(world.cell)
     near, grown = images.among(base), _grown(base, shifts, besides)[images.rows]
     table = lists.table.now(near)
@@ -143,9 +143,9 @@ def _margins(
     dt, velocity = (0.0, world.grains.velocity) if free is None else (free.dt, free.grains)
     if shifts is None:
         shifts = (np.zeros(world.large.velocity.shape) if free is None else dt * free.drives.free)[None]
-    way = greatest_travel(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
-    way = way + world.cell.margin(dt, world.grains)
-    return np.maximum(np.maximum(delta / 2, way), least), way, shifts
+    travel = greatest_travel(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
+    travel = travel + world.cell.margin(dt, world.grains)
+    return np.maximum(np.maximum(delta / 2, travel), least), travel, shifts
 
 
 def _that_touch(world: World, near: Neighbourhood, table: Primitives, pairs: Pairs) -> Pairs:
@@ -177,9 +177,9 @@ def _narrow(
 def _put_in_order(world: World, contacts: Contacts, pair: Ints, whole: bool) -> None:
     """Order the rows of the contacts of these pairs (nc,), unless the `whole` needs it only those from the first one on
     that has others behind it: shapes beside spheres come behind these, and touch in several points."""
-    back = (pair[1:] <= pair[:-1]).nonzero()[0]
-    if whole or len(back):
-        first = 0 if whole else int(np.searchsorted(pair[: back[0] + 1], pair[back[0] + 1 :].min()))
+    descents = (pair[1:] <= pair[:-1]).nonzero()[0]
+    if whole or len(descents):
+        first = 0 if whole else int(np.searchsorted(pair[: descents[0] + 1], pair[descents[0] + 1 :].min()))
         left = slice(first, None)
         order = contact_order(world, contacts.near, contacts.a[left], contacts.b[left], contacts.key[left])
         for column in contacts.columns().values():
@@ -198,8 +198,8 @@ def _motions(world: World, near: Neighbourhood, images: Images, prescribed: Floa
 
 
 def velocities_about(contacts: Contacts, velocity: Floats, large: Floats) -> Floats:
-    """Velocities (rows, 6) of all bodies of the neighbourhood of contacts, from those (owned, 6) of the bodies whose
-    rows each rank owns and those (large, 6) of the large bodies; collective."""
+    """Return velocities (rows, 6) of all bodies of the neighbourhood of contacts, from those (owned, 6) of the bodies
+    whose rows each rank owns and those (large, 6) of the large bodies; collective."""
     near = contacts.near
     table = np.zeros((len(near.bodies), 6))
     table[: near.grains] = velocity[: near.grains]
@@ -210,11 +210,11 @@ def velocities_about(contacts: Contacts, velocity: Floats, large: Floats) -> Flo
 
 def _without_images(world: World, contacts: Contacts, near: Neighbourhood, images: Images) -> Contacts:
     """The contacts of a table with images as contacts of the bodies of `near`, at the place of body a."""
-    (a, way), (b, moved) = images.place(contacts.a), images.place(contacts.b)
-    moved = moved - way
+    (a, shift), (b, moved) = images.place(contacts.a), images.place(contacts.b)
+    moved = moved - shift
     if contacts.moved is not None:
         moved += contacts.moved
-    found = replace(contacts, a=a, b=b, near=near, point=contacts.point - way, moved=moved)
+    found = replace(contacts, a=a, b=b, near=near, point=contacts.point - shift, moved=moved)
     if world.cell.moves:
         boundaries = images.boundaries(contacts.b) - images.boundaries(contacts.a)
         found = replace(found, drift=np.outer(world.cell.speed * boundaries, (1.0, 0.0, 0.0)))
@@ -262,8 +262,8 @@ def named(shapes, number, index, material, friction, features, grains, pairs, co
 
 
 def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Keys) -> Ints:
-    """The order of contacts of bodies in the rows a, b (nc,): first those whose solution needs no other rank, of bodies
-    that this rank owns or whose motion is prescribed; each part by the row of the owner and by key."""
+    """Return the order of contacts of bodies in the rows a, b (nc,): first those whose solution needs no other rank, of
+    bodies that this rank owns or whose motion is prescribed; each part by the row of the owner and by key."""
     foreign = np.zeros(len(near.bodies), dtype=bool)
     foreign[near.grains : near.grains + near.ghosts] = True
     if world.comm.rank < world.comm.size - 1:
@@ -273,17 +273,17 @@ def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Keys
 
 
 def exceeds_margin(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
-    """Whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as in one
-    of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
+    """Return whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as
+    in one of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
     free = bodies.is_dynamic(world.large)
     if not free.any():
         return False
     size = extents([body.shapes for body in world.large_bodies])[free]
 
-    def way(shift: Floats) -> Floats:
+    def distance(shift: Floats) -> Floats:
         return length(shift[..., free, :3]) + size * length(shift[..., free, 3:])
 
-    return bool(((way(shift) > delta / 2) & (way(shift - seen) > 0.01 * delta).all(axis=0)).any())
+    return bool(((distance(shift) > delta / 2) & (distance(shift - seen) > 0.01 * delta).all(axis=0)).any())
 
 
 @loop
@@ -293,15 +293,15 @@ def greatest_travel(shape: Ints, size: Floats, velocity: Floats, dt: float) -> F
     out = np.empty(len(shape))
     for n in range(len(shape)):
         v = velocity[n]
-        way, spin = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2), np.sqrt(v[3] ** 2 + v[4] ** 2 + v[5] ** 2)
+        speed, spin = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2), np.sqrt(v[3] ** 2 + v[4] ** 2 + v[5] ** 2)
         radius = np.sqrt(size[n, 0] ** 2 + size[n, 1] ** 2 + size[n, 2] ** 2)
         if shape[n] == CAPSULE:
             radius = size[n, 0] + size[n, 1]
         elif shape[n] >= FORM:
             radius = size[n, 0]
         if shape[n] != SPHERE:
-            way += radius * spin
-        out[n] = min(dt * way, 2.0 * radius) if np.isfinite(way + spin) else np.nan
+            speed += radius * spin
+        out[n] = min(dt * speed, 2.0 * radius) if np.isfinite(speed + spin) else np.nan
     return out
 
 
@@ -319,8 +319,8 @@ def _without_rigid(world: World, contacts: Contacts) -> Contacts:
     free, turns = free_directions(world.large_bodies) * moves, free_turns(world.large_bodies) * moves
     normal, opens = these.normal, np.zeros(len(these))
     moved = 0.0 if these.moved is None else these.moved
-    for body, way in ((these.a, 0.0), (these.b, moved)):
-        arm = these.point - near.bodies.position[body] - way
+    for body, shift in ((these.a, 0.0), (these.b, moved)):
+        arm = these.point - near.bodies.position[body] - shift
         lever = cross(arm / np.maximum(length(arm), 1e-300)[:, None], normal)
         opens += np.einsum("ci,cij,cj->c", normal, free[body - first], normal)
         opens += np.einsum("ci,cij,cj->c", lever, turns[body - first], lever)

@@ -125,7 +125,7 @@ def _pieces(rank: Ints) -> Pieces:
 
 
 def find_halo(comm: MPI.Comm, own: int, body: Ints) -> tuple[Halo, np.ndarray]:
-    """The halo of a rank with ``own`` bodies whose contacts touch these, and local numbers of them; collective.
+    """Return the halo of a rank with ``own`` bodies whose contacts touch these, and local numbers of them; collective.
 
     body : global indices in any shape, -1 for no body. The local numbers, uint32 in the same shape, are first those of
         the own bodies, then those of the ghosts, and the last row of a table is that of no body.

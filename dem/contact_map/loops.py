@@ -358,11 +358,11 @@ def _scale_numbers(mass, m, last_m, beta, out):
 def energy_of_step(mass, new_m, m, last_m, beta):
     """d' M^-1 d of d = new_m - (m + beta (m - last_m)), summed in double precision over parts of the bodies of
     ``mass``."""
-    way = m.dtype.type(beta)
+    factor = m.dtype.type(beta)
     sums = np.zeros((len(mass) + PART - 1) // PART)
     for part in prange(len(sums)):
         a, b = part * PART, min(part * PART + PART, len(mass))
-        sums[part] = _energy_of_part(mass[a:b], new_m[a:b], m[a:b], last_m[a:b], way)
+        sums[part] = _energy_of_part(mass[a:b], new_m[a:b], m[a:b], last_m[a:b], factor)
     return sums.sum()
 
 

@@ -52,7 +52,7 @@ class ContactMap:
         if halo is None or body is None:
             given = checked(comm, given)
             halo, body = find_halo(comm, given.columns, given.body)
-        self.comm, self.given, self.halo, self.body, self.precision = comm, given, halo, body, precision
+        self.comm, self.source, self.halo, self.body, self.precision = comm, given, halo, body, precision
         self.mass = InverseMass(given.root, precision) if mass is None else mass
         self.rows, self.columns, self.couples = given.rows, given.columns + self.mass.more, self.mass.couples
         self.log_flops: Callable[[float], None] = lambda count: None  #: told how many operations a product took
@@ -67,12 +67,12 @@ class ContactMap:
 
     def with_mass(self, mass: InverseMass) -> ContactMap:
         """The same rows between bodies of another inverse mass."""
-        return ContactMap(self.comm, self.given, self.halo, self.body, self.precision, mass)
+        return ContactMap(self.comm, self.source, self.halo, self.body, self.precision, mass)
 
     def part(self, contacts: Ints) -> ContactMap:
         """The map of these contacts alone, ascending, which shares the bodies with this one. Collective."""
         return ContactMap(
-            self.comm, self.given.only(contacts), self.halo, self.body[contacts], self.precision, self.mass
+            self.comm, self.source.only(contacts), self.halo, self.body[contacts], self.precision, self.mass
         )
 
     # -- products -------------------------------------------------------------------------------------------
@@ -96,7 +96,7 @@ class ContactMap:
         y = shaped("velocities of contacts", y, self.rows, 3)
         self._collect(g, self._m)
         shared = self._share(self._m)
-        loops.scale(self.mass.alone, self._m, self._w)
+        loops.scale(self.mass.unshared, self._m, self._w)
         self._send(shared)
         self._set_velocities(y, y, self.mass.rates(shared))
         self.log_flops(2 * self._flops)
@@ -150,14 +150,14 @@ class ContactMap:
         """y = before + G G' z (nc, 3) for the z whose image is image + beta (image - last)."""
         count = self.halo.rows
         shared = image[count:] + self.precision(beta) * (image[count:] - last[count:])
-        loops.scale_extrapolated(self.mass.alone, image, last, beta, self._w)
+        loops.scale_extrapolated(self.mass.unshared, image, last, beta, self._w)
         self._send(shared)
         self._set_velocities(before, y, self.mass.rates(shared))
         self.log_flops(self._flops + 12 * self.columns)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
         """d'GG'd of this rank's bodies, for the step d that leads from this z to the x with the image ``new``."""
-        first, energy = self.halo.rows, loops.energy_of_step(self.mass.alone, new, image, last, beta)
+        first, energy = self.halo.rows, loops.energy_of_step(self.mass.unshared, new, image, last, beta)
         shared = image[first:]
         return energy + self.mass.energy(new[first:] - shared - self.precision(beta) * (shared - last[first:]))
 
@@ -313,9 +313,9 @@ class ContactMap:
     def scaled(self, size: Floats, precision: type[np.floating] = np.float64) -> ContactMap:
         """The map with its rows multiplied by ``size`` (nc, 3)."""
         frame = np.empty((self.rows, 9), precision)
-        loops.scale_frames(self.given.frame, size, frame)
+        loops.scale_frames(self.source.frame, size, frame)
         mass = self.mass.rounded(precision)
-        other = ContactMap(self.comm, replace(self.given, frame=frame), self.halo, self.body, precision, mass)
+        other = ContactMap(self.comm, replace(self.source, frame=frame), self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
         if threads() > 1:
             other._ends = self._ends
@@ -323,12 +323,12 @@ class ContactMap:
 
     def structure(self) -> tuple[np.ndarray, ...]:
         """Arrays that are equal where contacts and their bodies are."""
-        return self.given.body, np.array([self.columns])
+        return self.source.body, np.array([self.columns])
 
     @cached_property
     def block_rows(self) -> BlockRows:
         """The rows as 3 x 6 blocks; collective at its first use."""
-        return self.mass.rows(self.comm, self.given, self.body_rows)
+        return self.mass.rows(self.comm, self.source, self.body_rows)
 
     @cached_property
     def body_rows(self) -> BlockRows:
@@ -337,12 +337,12 @@ class ContactMap:
 
     def frame_blocks(self) -> Floats:
         """The blocks (nc, 2, 3, 6) of both bodies without their masses, and without the sign of the first."""
-        frame, arms = self.given.frame.reshape(-1, 1, 3, 3), self.given.arm.reshape(-1, 2, 1, 3)
+        frame, arms = self.source.frame.reshape(-1, 1, 3, 3), self.source.arm.reshape(-1, 2, 1, 3)
         return np.concatenate(np.broadcast_arrays(frame, np.cross(arms, frame)), axis=3)
 
     def rows_of_blocks(self, blocks: Floats) -> BlockRows:
         """The rows that such blocks (nc, 2, 3, 6) make; collective."""
-        given = self.given
+        given = self.source
         root = np.zeros((self.halo.rows, given.root.shape[1]))
         root[: given.columns] = given.root
         self.halo.update(root)

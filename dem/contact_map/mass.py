@@ -35,13 +35,13 @@ class InverseMass:
     def __init__(self, root: Floats, precision: type[np.floating] = np.float64):
         self.precision = precision
         self.root, self.square = (np.ascontiguousarray(x, dtype=precision) for x in (root, squared(root)))
-        self.alone = self.square  #: M^-1 of the bodies that are in no shared coordinate, else zero
+        self.unshared = self.square  #: M^-1 of the bodies that are in no shared coordinate, else zero
 
     def rounded(self: Mass, precision: type[np.floating]) -> Mass:
         """The same in this precision."""
         other = copy.copy(self)
-        tables = (np.ascontiguousarray(x, dtype=precision) for x in (self.root, self.square, self.alone))
-        other.precision, (other.root, other.square, other.alone) = precision, tables
+        tables = (np.ascontiguousarray(x, dtype=precision) for x in (self.root, self.square, self.unshared))
+        other.precision, (other.root, other.square, other.unshared) = precision, tables
         return other
 
     def scale(self, v: Floats, out: Floats) -> None:
@@ -104,8 +104,8 @@ class ConstrainedMass(InverseMass):
         super().__init__(root, precision)
         self.comm, self.here, self.slot, self.coupling = comm, here, slot, coupling
         self.shared = len(coupling) // 6
-        self.alone = self.square.copy()
-        self.alone[here] = 0.0
+        self.unshared = self.square.copy()
+        self.unshared[here] = 0.0
         self._root = root_blocks(root[here])
 
     def uncoupled(self, z: Floats) -> Floats:

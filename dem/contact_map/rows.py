@@ -129,7 +129,7 @@ def _array(name: str, given: np.ndarray, kind: type, *shapes: tuple[int, ...]) -
 
 
 def root_blocks(root: Floats) -> Floats:
-    """Matrices in the format of `CompactRows.root` as blocks (n, 2, 3, 3)."""
+    """Return matrices in the format of `CompactRows.root` as blocks (n, 2, 3, 3)."""
     if root.shape[1] == 6:
         return root.reshape(-1, 2, 3, 1) * np.eye(3)
     return root.reshape(-1, 2, 6)[:, :, SYMMETRIC]

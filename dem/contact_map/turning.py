@@ -31,16 +31,16 @@ class TurningMap(ContactMap):
         precision: type[np.floating] = np.float64, mass: InverseMass | None = None,
     ):  # fmt: skip
         super().__init__(comm, given, halo, body, precision, mass)
-        self._given_turn, self._turn = turn, self._floats(turn)
+        self._turn_source, self._turn = turn, self._floats(turn)
         self.contacts, self.rows = given.rows, 2 * given.rows
 
     def with_mass(self, mass: InverseMass) -> TurningMap:
         """The same rows between bodies of another inverse mass."""
-        return TurningMap(self.comm, self.given, self._given_turn, self.halo, self.body, self.precision, mass)
+        return TurningMap(self.comm, self.source, self._turn_source, self.halo, self.body, self.precision, mass)
 
     def part(self, contacts: Ints) -> TurningMap:
         """The map of these contacts alone, ascending, which shares the bodies with this one. Collective."""
-        given, turn, body = self.given.only(contacts), self._given_turn[contacts], self.body[contacts]
+        given, turn, body = self.source.only(contacts), self._turn_source[contacts], self.body[contacts]
         return TurningMap(self.comm, given, turn, self.halo, body, self.precision, self.mass)
 
     def turning(self, v: Floats) -> Floats:
@@ -91,10 +91,10 @@ class TurningMap(ContactMap):
 
     def scaled(self, size: Floats, precision: type[np.floating] = np.float64) -> TurningMap:
         """The map with its rows multiplied by ``size`` (2 nc, 3)."""
-        rows = np.concatenate([self.given.frame, self._given_turn]).reshape(-1, 3, 3) * size[:, :, None]
+        rows = np.concatenate([self.source.frame, self._turn_source]).reshape(-1, 3, 3) * size[:, :, None]
         frame, turn = rows.reshape(2, -1, 9)
         mass = self.mass.rounded(precision)
-        other = TurningMap(self.comm, replace(self.given, frame=frame), turn, self.halo, self.body, precision, mass)
+        other = TurningMap(self.comm, replace(self.source, frame=frame), turn, self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
         return other
 
@@ -102,11 +102,11 @@ class TurningMap(ContactMap):
     def body_rows(self) -> BlockRows:
         """The rows as 3 x 6 blocks without what couples bodies; collective at its first use."""
         turning = np.zeros((self.contacts, 2, 3, 6))
-        turning[..., 3:] = self._given_turn.reshape(-1, 1, 3, 3)
+        turning[..., 3:] = self._turn_source.reshape(-1, 1, 3, 3)
         one, two = self.rows_of_blocks(self.frame_blocks()), self.rows_of_blocks(turning)
         indptr = np.concatenate([one.indptr, one.indptr[-1] + two.indptr[1:]])
         both = np.concatenate([one.indices, two.indices]), np.concatenate([one.blocks, two.blocks])
-        return BlockRows(indptr, *both, self.given.columns)
+        return BlockRows(indptr, *both, self.source.columns)
 
 
 @loop

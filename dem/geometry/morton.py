@@ -23,7 +23,7 @@ class Frame:
     extent: float
 
     @classmethod
-    def of(cls, points: np.ndarray) -> Frame:
+    def bounding(cls, points: np.ndarray) -> Frame:
         """The bounding cube of points (n, d)."""
         if len(points) == 0:
             return cls(np.zeros(1), 1.0)
@@ -44,7 +44,7 @@ def morton_codes(points: np.ndarray, frame: Frame | None = None) -> np.ndarray:
     >>> morton_codes(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])).argsort()
     array([0, 1, 2, 3])
     """
-    frame, last = frame or Frame.of(points), 2**BITS - 1
+    frame, last = frame or Frame.bounding(points), 2**BITS - 1
     grid = np.clip(np.floor((points - frame.low) / (frame.extent / last)), 0, last).astype(np.int64)
     for shift, mask in _SPREAD:
         grid = (grid | (grid << shift)) & mask

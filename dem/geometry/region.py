@@ -103,8 +103,8 @@ class Cylinder:
     def part(self, start: Floats, end: Floats) -> Floats:
         """Which part (n,) of the lines from `start` to `end` (n, 3) is inside; exact."""
         height, offset = self._split(start - np.asarray(self.start))
-        rise, way = self._split(end - start)
-        a, b = (way**2).sum(axis=1), (way * offset).sum(axis=1)
+        rise, radial = self._split(end - start)
+        a, b = (radial**2).sum(axis=1), (radial * offset).sum(axis=1)
         c = (offset**2).sum(axis=1) - self.radius**2
         with np.errstate(divide="ignore", invalid="ignore"):
             cuts = (np.array([0.0, self.length]) - height[:, None]) / rise[:, None]

@@ -51,10 +51,10 @@ def survey(
 
 def _of(grains: Bodies, speed: Callable[[Bodies], Floats]) -> Survey:
     centre = grains.position.mean(axis=0)
-    way, radius = grains.position - centre, bodies.bounding_radius(grains)
+    offset, radius = grains.position - centre, bodies.bounding_radius(grains)
     sums, place = (float(grains.mass.sum()), float(radius.sum())), grains.position
     return Survey(
-        len(grains), _extremes(grains, speed), *sums, centre, way.T @ way, place.min(axis=0), place.max(axis=0)
+        len(grains), _extremes(grains, speed), *sums, centre, offset.T @ offset, place.min(axis=0), place.max(axis=0)
     )
 
 
@@ -71,14 +71,14 @@ def _together(parts: Iterable[Survey], speed: Callable[[Bodies], Floats]) -> Sur
     none = np.full(3, np.inf)
     whole = Survey(0, bodies.none(), 0.0, 0.0, np.zeros(3), np.zeros((3, 3)), none, -none)
     for part in parts:
-        count, way = whole.count + part.count, part.centre - whole.centre
+        count, offset = whole.count + part.count, part.centre - whole.centre
         whole = Survey(
             count,
             _extremes(bodies.concatenate([whole.extremes, part.extremes]), speed),
             whole.mass + part.mass,
             whole.radius + part.radius,
-            whole.centre + part.count / count * way,
-            whole.spread + part.spread + whole.count * part.count / count * np.outer(way, way),
+            whole.centre + part.count / count * offset,
+            whole.spread + part.spread + whole.count * part.count / count * np.outer(offset, offset),
             np.minimum(whole.low, part.low),
             np.maximum(whole.high, part.high),
         )

@@ -32,7 +32,7 @@ class Fields(NamedTuple):
 
 
 def fields(sample: Sample, region: Block, cells: Sequence[int], width: float, kernel: str = "lucy") -> Fields:
-    """Coarse-grained fields on a grid of so many `cells` (3,) in the region.
+    """Return coarse-grained fields on a grid of so many `cells` (3,) in the region.
 
     `width` [m]: of the kernel "lucy" its range; of "gauss" the standard deviation, and it is cut at three of these
     and normalised. The integral of a contact's force along its branch takes three Gauss points on every branch.

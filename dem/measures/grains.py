@@ -60,8 +60,8 @@ def branches(sample: Sample, end: Ends, low: Floats, high: Floats, reach: float 
 
 
 def bearing(sample: Sample) -> Bools:
-    """Mask (nc,) of this rank's contacts that bear force: their normal force exceeds 1 % of the mean, as solvers leave
-    small forces at others."""
+    """Return the mask (nc,) of this rank's contacts that bear force: their normal force exceeds 1 % of the mean, as
+    solvers leave small forces at others."""
     normal = np.einsum("ck,ck->c", sample.force, sample.normal)
     total, count = sample.comm.allreduce(np.array([normal.sum(), len(normal)]))
     mask: Bools = normal > 0.01 * total / max(count, 1.0)
@@ -115,7 +115,7 @@ def _add(bodies, center, point, force, moment, bears, table):
 
 
 def triangle_forces(sample: Sample, body: int, mesh: Mesh, position: Floats, turn: Floats) -> Floats:
-    """Forces (triangles, 3) of grains on the triangles of a mesh, in the world frame [N].
+    """Return forces (triangles, 3) of grains on the triangles of a mesh, in the world frame [N].
 
     The mesh is all of the large body of this number (`Sample.bodies`) at `position` (3,) [m] and orientation `turn`
     (4,). A contact's force is that of the triangle nearest to its point, or to an image of it: searches keep no
@@ -123,9 +123,9 @@ def triangle_forces(sample: Sample, body: int, mesh: Mesh, position: Floats, tur
     first, second = (sample.bodies[:, side] == body for side in (0, 1))
     force = sample.force * (second.astype(float) - first)[:, None]
     rows = first | second
-    back, own = quaternion.conjugate(turn), np.array(mesh.quaternion)
+    inverse_turn, own = quaternion.conjugate(turn), np.array(mesh.quaternion)
     point = sample.point[rows, None] + about(sample.lattice)  # a mesh is no longer than the cell
-    point = quaternion.rotate(back, point - position) - np.array(mesh.center)
+    point = quaternion.rotate(inverse_turn, point - position) - np.array(mesh.center)
     point = quaternion.rotate(quaternion.conjugate(own), point) - mesh.surface.middle
     out = np.zeros((len(mesh.surface.triangle), 3))
     np.add.at(out, nearest(mesh.surface, point), force[rows])

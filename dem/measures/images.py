@@ -65,9 +65,9 @@ def _inside(point: Floats, way: Floats, low: Floats, high: Floats) -> Ints:
 
 def about(lattice: Floats) -> Floats:
     """The ways (k, 3) to the next images of a lattice (3, 3) on all sides, and to the point itself [m]."""
-    steps = [np.arange(-1.0, 2.0) if way.any() else np.zeros(1) for way in lattice]
-    ways: Floats = np.array(list(product(*steps))) @ lattice
-    return ways
+    steps = [np.arange(-1.0, 2.0) if vector.any() else np.zeros(1) for vector in lattice]
+    vectors: Floats = np.array(list(product(*steps))) @ lattice
+    return vectors
 
 
 def nearest_image(vector: Floats, lattice: Floats) -> Floats:

@@ -23,7 +23,7 @@ class Profile(NamedTuple):
 
 
 def profile(sample: Sample, axis: ArrayLike, edges: ArrayLike) -> Profile:
-    """What is where along a direction `axis` (3,), in bins between the ascending `edges` (bins + 1,) [m].
+    """Return what is where along a direction `axis` (3,), in bins between the ascending `edges` (bins + 1,) [m].
 
     Along an axis with a period the edges may go on beyond the cell, with images of its grains; along other directions
     each grain counts once."""
@@ -44,7 +44,7 @@ def profile(sample: Sample, axis: ArrayLike, edges: ArrayLike) -> Profile:
 
 
 def mean_position(sample: Sample, mask: Bools) -> Floats:
-    """Mean (3,) of the centres of the grains of a mask (n,) [m]; NaN if there are none."""
+    """Return the mean (3,) of the centres of the grains of a mask (n,) [m]; NaN if there are none."""
     total = summed(sample, np.append(sample.position[mask].sum(axis=0), mask.sum()))
     return total[:3] / (total[3] or np.nan)
 
@@ -57,7 +57,7 @@ class Mixing(NamedTuple):
 
 
 def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> Mixing:
-    """Mixing of the grains of a mask (n,) with the others, by centres in the cells of a grid.
+    """Return the mixing of the grains of a mask (n,) with the others, by centres in the cells of a grid.
 
     With p the fraction of them among all, and s^2 the variance of the fractions in the cells, each with the weight of
     its grains: Lacey's index is (p (1 - p) - s^2) / (p (1 - p) - p (1 - p) / m) for cells of m grains on average that

@@ -42,7 +42,7 @@ class Sample:
     def __repr__(self) -> str:
         return f"<Sample of this rank: {len(self.id)} grains, {len(self.gap)} contacts>"
 
-    def of(self, material: str) -> Bools:
+    def of_material(self, material: str) -> Bools:
         """Mask (n,) of the grains of a material; ValueError if there is none of that name."""
         if material not in self.materials:
             raise ValueError(f"material {material!r}: allowed is one of {', '.join(self.materials)}")

@@ -15,9 +15,9 @@ from dem.measures.sample import Sample, summed
 
 
 def stress(sample: Sample, region: Region | Bools, volume: float | None = None) -> Floats:
-    """Mean contact stress (3, 3) of a region, or of the grains of a mask (n,) over a given volume [m^3]: the sum of
-    force times branch over the volume [Pa]. A region counts of each branch the part within it, so neighbouring regions
-    leave nothing out. ValueError for a mask without volume."""
+    """Return the mean contact stress (3, 3) of a region, or of the grains of a mask (n,) over a given volume [m^3]: the
+    sum of force times branch over the volume [Pa]. A region counts of each branch the part within it, so neighbouring
+    regions leave nothing out. ValueError for a mask without volume."""
     end = ends(sample)
     if isinstance(region, (Block, Cylinder)):
         row, point, branch = branches(sample, end, *region.bounds)
@@ -29,8 +29,8 @@ def stress(sample: Sample, region: Region | Bools, volume: float | None = None) 
 
 
 def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None = None) -> Floats:
-    """Kinetic part (3, 3) of the stress: the sum of m v' v' over the volume, of the grains with their centres in a
-    region, or of those of a mask; v' is the velocity beyond the mean one of these [Pa]."""
+    """Return the kinetic part (3, 3) of the stress: the sum of m v' v' over the volume, of the grains with their
+    centres in a region, or of those of a mask; v' is the velocity beyond the mean one of these [Pa]."""
     if isinstance(region, (Block, Cylinder)):
         row, place, velocity = sample.grains_in(*region.bounds)
         inside, volume = region.contains(place), region.volume
@@ -43,8 +43,8 @@ def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None 
 
 
 def fabric(sample: Sample, region: Region) -> Floats:
-    """Fabric tensor (3, 3): the mean of n n over the contacts that bear force and have their points in the region; its
-    trace is 1, and 0 if there are no such contacts."""
+    """Return the fabric tensor (3, 3): the mean of n n over the contacts that bear force and have their points in the
+    region; its trace is 1, and 0 if there are no such contacts."""
     bears = np.flatnonzero(bearing(sample))
     row, step = images(sample.point[bears], sample.lattice, *region.bounds)
     inside = region.contains(sample.point[bears[row]] + step @ sample.lattice)
@@ -54,8 +54,8 @@ def fabric(sample: Sample, region: Region) -> Floats:
 
 
 def solid_fraction(sample: Sample, region: Region) -> float:
-    """Volume of the grains in a region over its volume. Spheres that the faces of a Block cut count with the part
-    inside, to 1e-3 of a sphere where several faces cut it and exactly where one does; other grains, and all in a
+    """Return the volume of the grains in a region over its volume. Spheres that the faces of a Block cut count with the
+    part inside, to 1e-3 of a sphere where several faces cut it and exactly where one does; other grains, and all in a
     Cylinder, count whole if their centre is inside."""
     row, place, _ = sample.grains_in(*region.bounds, float(sample.size[sample.shape == SPHERE, 0].max(initial=0.0)))
     volume = sample.volume[row] * region.contains(place)

@@ -117,8 +117,8 @@ def _free_projectors(motion: Any) -> Floats:
 def _leading_to(motion: Prescribed, time: float, position: Floats, orientation: Floats) -> Pose:
     """The pose at time zero of a body that the motion brings to this pose at `time`. ValueError if there is none."""
     shift, turn = checked_pose(motion, time, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-    back = quaternion.conjugate(turn)
-    start = quaternion.rotate(back, position - shift), quaternion.multiply(back, orientation)
+    inverse_turn = quaternion.conjugate(turn)
+    start = quaternion.rotate(inverse_turn, position - shift), quaternion.multiply(inverse_turn, orientation)
     place, turned = checked_pose(motion, time, *start)
     size = np.abs([place, position]).max() + np.abs(shift).max()
     if np.abs(place - position).max() > 1e-9 * size or abs(turned @ orientation) < 1.0 - 1e-9:

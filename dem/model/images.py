@@ -63,7 +63,7 @@ class Images:
     source: Ints  #: (images,) rows of the grains and ghosts in the table of the neighbourhood
     steps: Floats  #: (images, 3) periods by which they are moved
     across: Floats  #: (images,) number of sheared boundaries between them and their grains
-    way: Floats  #: (images, 3) by which they are moved [m]
+    shift: Floats  #: (images, 3) by which they are moved [m]
     base: int  #: number of grains and ghosts
 
     def __len__(self) -> int:
@@ -71,7 +71,7 @@ class Images:
 
     def now(self, cell: Cell) -> Images:
         """The same where the shear and the size of the cell have brought them."""
-        return replace(self, way=cell.moved(self.steps, self.across)) if len(self) else self
+        return replace(self, shift=cell.moved(self.steps, self.across)) if len(self) else self
 
     @cached_property
     def rows(self) -> Ints:
@@ -85,7 +85,7 @@ class Images:
         count = len(near.bodies) - self.base
         rows = np.concatenate([self.rows, self.base + np.arange(count)])
         table = near.bodies.take(rows)
-        table.position[self.base : len(self.rows)] += self.way
+        table.position[self.base : len(self.rows)] += self.shift
         ghosts = near.ghosts + len(self.source)
         return Neighbourhood(table, near.margin[self.rows], near.index[rows], near.grains, ghosts)
 
@@ -93,11 +93,11 @@ class Images:
         """The rows (nc,) in the table of the neighbourhood of those in the table with images, and by what ways (nc, 3)
         images are moved [m]."""
         last, image = len(self.rows), np.flatnonzero((row >= self.base) & (row < len(self.rows)))
-        way = np.zeros((len(row), 3))
-        way[image] = self.way[row[image] - self.base]
+        shift = np.zeros((len(row), 3))
+        shift[image] = self.shift[row[image] - self.base]
         out = np.where(row >= last, row - len(self.source), row)
         out[image] = self.source[row[image] - self.base]
-        return out, way
+        return out, shift
 
     def boundaries(self, row: Ints) -> Floats:
         """Numbers (nc,) of sheared boundaries between bodies in rows of the table with images and the cell."""

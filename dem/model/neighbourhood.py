@@ -33,7 +33,7 @@ class Neighbourhood:
 
 
 def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
-    """All bodies whose margin may meet the margin of a local grain; `margin` (grains,) [m] of the local grains;
+    """Return all bodies whose margin may meet the margin of a local grain; `margin` (grains,) [m] of the local grains;
     collective.
 
     FloatingPointError, on all ranks, if a position or margin is not finite.
@@ -63,8 +63,8 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
 
 
 def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> Neighbourhood:
-    """The same bodies as they are now, with these margins (grains,) [m] of the local ones; the halo is that of the
-    grains of `near`; collective."""
+    """Return the same bodies as they are now, with these margins (grains,) [m] of the local ones; the halo is that of
+    the grains of `near`; collective."""
     grains, count = near.grains, near.grains + near.ghosts
     ghosts = np.empty((0, 14))
     if world.comm.size > 1:  # one message with all that steps change
@@ -81,7 +81,7 @@ def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> 
 
 
 def chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:
-    """Bounding boxes (count, 2, 3) of equal pieces of a slab; empty ones reach from +inf to -inf."""
+    """Return bounding boxes (count, 2, 3) of equal pieces of a slab; empty ones reach from +inf to -inf."""
     boxes = np.empty((count, 2, 3))
     boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
     if not (np.isfinite(position).all() and np.isfinite(radius).all()):

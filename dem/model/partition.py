@@ -17,7 +17,7 @@ from dem.model.world import World
 
 
 def splitters(comm: MPI.Comm, codes: Ints, weights: Floats, pieces: int, part: float = 1e-3) -> Ints:
-    """Codes (pieces - 1,) at which the curve is cut into pieces of equal weight, but for this `part` of a piece;
+    """Return codes (pieces - 1,) at which the curve is cut into pieces of equal weight, but for this `part` of a piece;
     collective.
 
     codes (n,), weights (n,): of the local grains, in any order; weights are whole numbers, so that sums are the same on
@@ -46,8 +46,8 @@ def splitters(comm: MPI.Comm, codes: Ints, weights: Floats, pieces: int, part: f
 
 
 def frame_of_most(comm: MPI.Comm, positions: Floats) -> Frame:
-    """The cube about all positions (n, 3) of the ranks but those that are far away, whose codes are those of its faces:
-    the others would share one cell with all others. Collective.
+    """Return the cube about all positions (n, 3) of the ranks but those that are far away, whose codes are those of its
+    faces: the others would share one cell with all others. Collective.
 
     Along each axis it leaves out what is further from the middle half of the positions than 16 times its width."""
     ends = np.full((2, 3), np.inf)
@@ -79,7 +79,7 @@ def redistribute(world: World) -> None:
 
 
 def imbalance(world: World) -> float:
-    """Greatest load of a rank over the mean load, in contacts plus grains; collective."""
+    """Return the greatest load of a rank over the mean load, in contacts plus grains; collective."""
     greatest, _, mean = _loads(world)
     return greatest / mean
 

@@ -15,7 +15,7 @@ from dem.bodies import Bodies
 from dem.motion import Dynamic, Pose, checked_pose
 from dem.parts.cell import OPEN, Cell
 from dem.parts.contact_law import ContactLaw
-from dem.parts.sources import Passages
+from dem.parts.passages import Passages
 from dem.scene import LargeBody, no_parts
 from dem.shapes.forms import Form
 from dem.together import together
@@ -113,6 +113,11 @@ class World:
         """Number of bodies whose rows this rank owns: its grains, and on the last rank the large bodies."""
         return len(self.grains) + (len(self.large) if self.comm.rank == self.comm.size - 1 else 0)
 
+    @property
+    def turns_unlike_spheres(self) -> bool:
+        """Whether a body that turns freely may do so in another way than a sphere; the same on all ranks."""
+        return not self.only_spheres or bool(np.isfinite(self.large.inertia).all(axis=1).any())
+
     def large_row(self, name: str) -> int:
         """Row of a large body in `large`; KeyError if there is none of that name."""
         names = [body.name for body in self.large_bodies]
@@ -143,8 +148,3 @@ class World:
         """Put large bodies, by row, into these poses."""
         for row, pose in poses.items():
             self.large.position[row], self.large.quaternion[row] = pose
-
-
-def turns_unlike_spheres(world: World) -> bool:
-    """Whether a body that turns freely may do so in another way than a sphere; the same on all ranks."""
-    return not world.only_spheres or bool(np.isfinite(world.large.inertia).all(axis=1).any())

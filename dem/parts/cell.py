@@ -122,9 +122,9 @@ class Cell(Named):
         out[:, 0] += faster * crossed
         return out
 
-    def whole(self, way: Floats) -> Floats:
+    def whole(self, vector: Floats) -> Floats:
         """The part (..., 3) of ways (..., 3) that is whole periods [m]; without it, ways lead to the nearest image."""
-        return self._lengths * np.round(way / self.period)
+        return self._lengths * np.round(vector / self.period)
 
     def images(self) -> tuple[Floats, Floats]:
         """By how many periods (k, 3) a body and its images about the cell are moved, and how many sheared boundaries
@@ -149,19 +149,19 @@ class Cell(Named):
 
     def moved(self, steps: Floats, across: Floats) -> Floats:
         """The ways (k, 3) by so many periods (k, 3) and over so many sheared boundaries (k,) [m]."""
-        way = steps * self._lengths
-        way[:, 0] += across * self.shift
-        return way
+        vector = steps * self._lengths
+        vector[:, 0] += across * self.shift
+        return vector
 
     @property
     def lattice(self) -> tuple[Floats, Floats]:
         """The ways (3, 3) to the next images along each axis [m], and their velocities (3, 3) [m/s]; zeros along axes
         without a period. Sheared images are the nearest along x."""
-        way, drift = np.diag(self._lengths), np.zeros((3, 3))
+        vectors, drift = np.diag(self._lengths), np.zeros((3, 3))
         if self.gradient is not None:
-            way[self.gradient, 0] = self.shift - self.period[0] * np.round(self.shift / self.period[0])
+            vectors[self.gradient, 0] = self.shift - self.period[0] * np.round(self.shift / self.period[0])
             drift[self.gradient, 0] = self.speed
-        return way, drift
+        return vectors, drift
 
     # -- motion ----------------------------------------------------------------------------------------------
 
@@ -261,8 +261,8 @@ class Cell(Named):
 
     def attributes(self) -> dict[str, Floats]:
         """What a frame has of the cell; nothing of open space."""
-        way, drift = self.lattice
-        return {"lattice": way, "drift": drift, "rate": self.rate} if self.periodic else {}
+        vectors, drift = self.lattice
+        return {"lattice": vectors, "drift": drift, "rate": self.rate} if self.periodic else {}
 
     def record(self, stress: Callable[[], Floats]) -> dict[str, float]:
         """The periods, and the stress (3, 3) [Pa]; nothing of a cell that does not move, or has a direction without a

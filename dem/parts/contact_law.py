@@ -96,7 +96,7 @@ CHECKS = {each.name: each.metadata["check"] for each in fields(ContactLaw)}
 
 
 def law(values: Mapping[str, float | None], before: ContactLaw | None = None) -> ContactLaw:
-    """The law with these coefficients; None, and what is not given: as `before`. ValueError for a bad one."""
+    """Return the law with these coefficients; None, and what is not given: as `before`. ValueError for a bad one."""
     for name in values:
         if name not in CHECKS:
             allowed = f"allowed are {', '.join(CHECKS)}{checks.nearest(name, CHECKS)}"
@@ -108,8 +108,8 @@ def law(values: Mapping[str, float | None], before: ContactLaw | None = None) ->
 def tables(
     count: int, usual: ContactLaw, others: Mapping[tuple[int, int], ContactLaw], stiffness: float
 ) -> ContactLaw:
-    """The tables of so many materials, with the `usual` law but in the pairs of `others`, and this `stiffness` [N/m]
-    where none is stated."""
+    """Return the tables of so many materials, with the `usual` law but in the pairs of `others`, and this `stiffness`
+    [N/m] where none is stated."""
 
     def table(name: str) -> np.ndarray:
         found = np.full((count, count), getattr(usual, name), dtype=float)  # None is NaN

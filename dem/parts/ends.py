@@ -40,7 +40,7 @@ class Tie(Named):
         object.__setattr__(self, "anchors", anchors)
 
     def refuse(self, name: str, world: Any) -> None:
-        if world.passages.outlets and any(isinstance(end, int) for end in self.ends):
+        if world.passages.removes and any(isinstance(end, int) for end in self.ends):
             kind = type(self).__name__.lower()
             raise ValueError(f"{kind} {name!r} holds a grain: with outlets {kind}s may hold large bodies alone")
 
@@ -69,7 +69,7 @@ Place = Callable[[Floats, Floats], Geometry]
 class Condition(NamedTuple):
     """What a constraint asks of one of its six relative velocities."""
 
-    way: int
+    coordinate: int  #: which of the six
     kind: int  #: HELD, MOTOR, LOWER or UPPER
     target: float  #: [m/s, rad/s]
     bound: float = np.inf  #: greatest impulse of a motor
@@ -101,4 +101,4 @@ class Ends(NamedTuple):
     free: Floats  #: (n, 6) after the step, without contacts, drives and what is not yet applied [m/s, rad/s]
     inverse_mass: Floats  #: (n, 6, 6)
     moments: Floats  #: (n, 3) principal moments of inertia, inf: it does not turn freely [kg m^2]
-    given: Floats  #: (n, 3) what is applied changes of the angular velocities in `free` [rad/s]
+    spin_change: Floats  #: (n, 3) what is applied changes of the angular velocities in `free` [rad/s]

@@ -56,7 +56,7 @@ class Kind(NamedTuple):
     """A kind of joint."""
 
     holds: tuple[bool, ...]  #: which of three translations and three turns, along the axes of the joint; z is the axis
-    way: int = 5  #: the number of its free coordinate among these, that of motors and limits
+    coordinate: int = 5  #: the number of its free coordinate among these, that of motors and limits
     motor: bool = False  #: whether it may have them
     turned: Callable[[Floats, Floats, Floats], tuple[Floats, Floats]] = turned
     axes: int = 1  #: that a user gives; of two the second one is the x axis
@@ -64,7 +64,7 @@ class Kind(NamedTuple):
 
 KINDS = {
     "hinge": Kind((True, True, True, True, True, False), motor=True, turned=turned_about_z),
-    "slider": Kind((True, True, False, True, True, True), way=2, motor=True),
+    "slider": Kind((True, True, False, True, True, True), coordinate=2, motor=True),
     "ball": Kind((True, True, True, False, False, False)),
     "fixed": Kind((True,) * 6),
     "universal": Kind((True, True, True, False, True, False), turned=turned_about_pins, axes=2),
@@ -137,9 +137,9 @@ class Joint(Constraint):
         anchors: list[Any] = []
         frames: list[Any] = []
         for position, turn in (scene.pose(f"joint {name!r}", end) for end in ends):
-            back, arm = quaternion.conjugate(turn), place - position
-            anchors.append(quaternion.rotate(back, arm - scene.cell.whole(arm)))
-            frames.append(tuple(quaternion.multiply(back, upright).tolist()))
+            inverse_turn, arm = quaternion.conjugate(turn), place - position
+            anchors.append(quaternion.rotate(inverse_turn, arm - scene.cell.whole(arm)))
+            frames.append(tuple(quaternion.multiply(inverse_turn, upright).tolist()))
         for body in scene.large_bodies:
             if body.name in ends and isinstance(body.motion, Driven):
                 raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
@@ -156,7 +156,7 @@ class Joint(Constraint):
     @property
     def coordinate(self) -> int:
         """The number of its free coordinate among three translations and three turns: that of motors and limits."""
-        return KINDS[self.kind].way
+        return KINDS[self.kind].coordinate
 
     def changed(self, time: float, tally: Any, **values: Any) -> Joint:
         """As of `Named`; with a `speed` there is no `target`, and the other way round."""
@@ -168,7 +168,8 @@ class Joint(Constraint):
 
     def conditions(self, error: Floats, dt: float) -> list[Condition]:
         at = error[self.coordinate]
-        found = [Condition(way, HELD, -error[way] / dt) for way in np.flatnonzero(KINDS[self.kind].holds).tolist()]
+        holds = np.flatnonzero(KINDS[self.kind].holds).tolist()
+        found = [Condition(coordinate, HELD, -error[coordinate] / dt) for coordinate in holds]
         if self.driven:
             speed = self.speed if self.target is None else (self.target - at) / dt
             speed = min(max(speed, (self.low - at) / dt), (self.high - at) / dt)  # it stops at its limits

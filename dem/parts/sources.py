@@ -1,4 +1,4 @@
-"""Sources, where grains come into a scene, and outlets, where they leave it; see docs/sources.md.
+"""Sources, where grains come into a scene; see docs/sources.md.
 
 A grain of a source follows from its seed, its name and the number of the grain alone: random numbers are a hash of
 these. So no generator has a state, and a run that goes on from a checkpoint has the same grains on any number of ranks.
@@ -6,73 +6,23 @@ these. So no generator has a state, and a run that goes on from a checkpoint has
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from dem import checks, quaternion, shapes
-from dem.arrays import Bools, Floats, Ints
-from dem.bodies import SPHERE, Bodies, concatenate, enclosing_radius, none
+from dem.arrays import Floats, Ints
+from dem.bodies import SPHERE, Bodies, enclosing_radius
 from dem.geometry.region import Block, Cylinder
 from dem.motion import Timed
 from dem.parts.named import Named
+from dem.parts.sizes import Listed, Uniform
 from dem.shapes import Box, Capsule
 from dem.together import digest
 
-#: In scenes with sources grains have ids below this number, and large bodies from it on.
-MOST_IDS = 10**12
-
 TRIES = 64  #: places that are tried for a grain in a step
-
-
-@dataclass(frozen=True)
-class Uniform:
-    """Sizes that are uniform between two, by number."""
-
-    low: float
-    high: float
-
-    def __post_init__(self) -> None:
-        checks.positive("size of a grain", [self.low, self.high])
-        if self.high < self.low:
-            raise ValueError(f"sizes from {self.low:g} to {self.high:g}: the second must not be less")
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """The least and the greatest size [m]."""
-        return self.low, self.high
-
-    def at(self, share: Floats) -> Floats:
-        """The sizes (n,) below which these shares (n,) of the grains are."""
-        return self.low + share * (self.high - self.low)
-
-
-@dataclass(frozen=True)
-class Listed:
-    """Some sizes, each of which a share of the grains has, by number; without shares all alike."""
-
-    values: Sequence[float]
-    shares: Sequence[float] = ()
-
-    def __post_init__(self) -> None:
-        checks.positive("size of a grain", self.values)
-        if not len(self.values) or (len(self.shares) and len(self.shares) != len(self.values)):
-            raise ValueError(f"{len(self.values)} sizes of grains with {len(self.shares)} shares")
-        checks.not_negative("share of grains", self.shares)
-        if len(self.shares) and not sum(self.shares) > 0.0:
-            raise ValueError("shares of grains are all zero")
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """The least and the greatest size [m]."""
-        return min(self.values), max(self.values)
-
-    def at(self, share: Floats) -> Floats:
-        """As of `Uniform`."""
-        parts = np.cumsum(self.shares if len(self.shares) else np.ones(len(self.values)))
-        return np.array(self.values)[np.searchsorted(parts / parts[-1], share, side="right")]
 
 
 @dataclass(frozen=True)
@@ -101,7 +51,7 @@ class Source(Named, Timed):
 
     def __post_init__(self) -> None:
         self._check_times()
-        _refuse_region("source", self.region)
+        refuse_region("source", self.region)
         if (self.mass_rate is None) == (self.number_rate is None):
             raise ValueError("a source has either a mass_rate [kg/s] or a number_rate [1/s]")
         given = [rate for rate in (self.mass_rate, self.number_rate) if rate is not None]
@@ -188,22 +138,6 @@ class Source(Named, Timed):
         return points(self.region, random).reshape(len(serial), TRIES, 3)
 
 
-@dataclass(frozen=True)
-class Outlet:
-    """Grains whose centres are in the region leave; with `outside` those whose centres are not in it."""
-
-    region: Block | Cylinder
-    outside: bool = False
-
-    def __post_init__(self) -> None:
-        _refuse_region("outlet", self.region)
-
-    def takes(self, position: Floats) -> Bools:
-        """Mask (n,) of the centres (n, 3) [m] that leave."""
-        inside: Bools = self.region.contains(position)
-        return ~inside if self.outside else inside
-
-
 @dataclass
 class Tally:
     """What has passed a source or an outlet up to now."""
@@ -214,105 +148,8 @@ class Tally:
     refused: int = 0  #: steps in which the next grain of a source was due, but found no place
 
 
-@dataclass(frozen=True)
-class Passages:
-    """The sources and outlets of a scene by name, and what has passed each of them up to now.
-
-    What comes and goes in a step is found by `dem.record.passage.insert_and_remove`; the rest asks these methods alone.
-    """
-
-    sources: dict[str, Source] = field(default_factory=dict)
-    outlets: dict[str, Outlet] = field(default_factory=dict)
-    tallies: dict[str, Tally] = field(default_factory=dict)  #: of sources, then of outlets
-
-    @property
-    def names(self) -> list[str]:
-        return [*self.sources, *self.outlets]
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def add(self, name: str, part: Source | Outlet) -> None:
-        """Put a part under a name of its own; ValueError for another one."""
-        if not name or set(name) & set(',"\n') or name in self.names:
-            raise ValueError(f"sources and outlets need distinct names without commas, got {name!r}")
-        if isinstance(part, Source):
-            self.sources[name] = part
-        else:
-            self.outlets[name] = part
-
-    def counted(self) -> Passages:
-        """The same sources and outlets with other tallies, which are as these."""
-        tallies = {name: replace(self.tallies.get(name, Tally())) for name in self.names}
-        return Passages(self.sources, self.outlets, tallies)
-
-    @property
-    def inserted_count(self) -> int:
-        """Number of grains that have come."""
-        return sum(self.tallies[name].count for name in self.sources)
-
-    @property
-    def removed_count(self) -> int:
-        """Number of grains that have left."""
-        return sum(self.tallies[name].count for name in self.outlets)
-
-    @property
-    def most(self) -> float:
-        """How many grains may come."""
-        return np.inf if self.sources else 0.0
-
-    def first_large(self, count: int) -> int:
-        """The id of the first large body of a scene with so many grains: more than that of any that may come."""
-        return MOST_IDS if self.sources else count
-
-    def extremes(self) -> Bodies:
-        """The grains that may come: of each source the smallest and the largest one."""
-        return concatenate([none(), *(source.extremes() for source in self.sources.values())])
-
-    def boxes(self) -> Floats:
-        """Lower and upper corners (sources, 2, 3) of the boxes about the regions in which grains come [m]."""
-        return np.array([bounds(source.region) for source in self.sources.values()]).reshape(-1, 2, 3)
-
-    @property
-    def density(self) -> float:
-        """The greatest of grains that may come; 0 without [kg/m^3]."""
-        return max((source.density for source in self.sources.values()), default=0.0)
-
-    def passed(self, what: str, name: str) -> Tally:
-        """What has passed the "source" or "outlet" of this name; ValueError if there is none."""
-        there: Mapping[str, Any] = self.sources if what == "source" else self.outlets
-        if name not in there:
-            raise ValueError(f"no {what} {name!r}; there are: {', '.join(there) or 'none'}")
-        return replace(self.tallies[name])
-
-    def record(self) -> dict[str, float]:
-        """What has passed each up to now, how many steps a source had no room, and the energies that came and went with
-        grains before this step [J]; nothing without."""
-        out: dict[str, float] = {}
-        for name, tally in self.tallies.items():
-            out |= {f"count_{name}": tally.count, f"mass_{name} [kg]": tally.mass}
-            if name in self.sources:
-                out[f"refused_{name}"] = tally.refused
-        for kind, names in (("sources", self.sources), ("outlets", self.outlets)) if out else ():
-            out[f"energy_of_{kind} [J]"] = sum(self.tallies[name].energy for name in names)
-        return out
-
-    def state(self) -> dict[str, np.ndarray]:
-        """The arrays of a checkpoint, for `restored`."""
-        rows = [[float(getattr(tally, each.name)) for each in fields(Tally)] for tally in self.tallies.values()]
-        return {"tallies": np.array(rows)} if rows else {}
-
-    def restored(self, kept: Mapping[str, np.ndarray]) -> Passages:
-        """These of a scene, with the tallies of a checkpoint. ValueError if it has none of them."""
-        rows, names = np.array(kept.get("tallies", np.zeros((0, 4)))), self.names
-        if rows.shape != (len(names), 4) or not (np.isfinite(rows).all() and (rows[:, [0, 1, 3]] >= 0.0).all()):
-            raise ValueError(f"the state has no counts of the sources and outlets {', '.join(names) or 'none'}")
-        tallies = (Tally(int(count), mass, energy, int(refused)) for count, mass, energy, refused in rows.tolist())
-        return replace(self, tallies=dict(zip(names, tallies)))
-
-
 def bounds(region: Block | Cylinder) -> Floats:
-    """The lower and upper corner (2, 3) of the box about a region [m]."""
+    """Return the lower and upper corner (2, 3) of the box about a region [m]."""
     if isinstance(region, Block):
         return np.array([region.low, region.high], float)
     ends = np.array([region.start, region.end], float)
@@ -322,7 +159,7 @@ def bounds(region: Block | Cylinder) -> Floats:
 
 
 def points(region: Block | Cylinder, random: Floats) -> Floats:
-    """Points (n, 3) that are uniform in a region, from numbers (n, 3) from 0 to 1."""
+    """Return points (n, 3) that are uniform in a region, from numbers (n, 3) from 0 to 1."""
     if isinstance(region, Block):
         low, high = bounds(region)
         return low + random * (high - low)
@@ -334,7 +171,7 @@ def points(region: Block | Cylinder, random: Floats) -> Floats:
 
 
 def numbers(name: str, seed: int, serial: Ints, draws: range) -> Floats:
-    """Random numbers (n, draws) from 0 to 1 of the grains (n,) of a source, which depend on nothing else.
+    """Return random numbers (n, draws) from 0 to 1 of the grains (n,) of a source, which depend on nothing else.
 
     A hash of the counters: the mixer of SplitMix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number
     generators", OOPSLA 2014), once for the source, once for the grain and once for the draw."""
@@ -358,12 +195,13 @@ def _turns(random: Floats) -> Floats:
     return np.stack([one * np.sin(a), one * np.cos(a), two * np.sin(b), two * np.cos(b)], axis=1)
 
 
-def _refuse_region(what: str, region: Any) -> None:
+def refuse_region(what: str, region: Any) -> None:
+    """Raise ValueError for what is no region."""
     if not isinstance(region, (Block, Cylinder)):
         raise ValueError(f"region of a {what}: allowed is a Block or a Cylinder of dem.measures, got {region!r}")
 
 
 def reach(table: Bodies) -> Floats:
-    """Radii (n,) of the spheres about grains [m]."""
+    """Return radii (n,) of the spheres about grains [m]."""
     return enclosing_radius(table.shape, table.size)
 

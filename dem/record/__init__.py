@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:
-    """All quantities of a step by name, with units in brackets. SceneError if the scene's `record` fails or returns
-    something else than numbers by name."""
+    """Return all quantities of a step by name, with units in brackets. SceneError if the scene's `record` fails or
+    returns something else than numbers by name."""
     out = {"step": step.world.step, "time [s]": step.world.time}
     out |= energy_balance(step) | contact_statistics(step) | step.world.passages.record()
     out |= cell(step)
@@ -70,12 +70,12 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
 
 
 def cell(step: Step) -> dict[str, float]:
-    """The size of the cell at the end of the step, and the stress of its contacts and grains."""
+    """Return the size of the cell at the end of the step, and the stress of its contacts and grains."""
     return step.world.cell.record(lambda: cell_stress(step.world, step.contacts, step.force))
 
 
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
-    """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
+    """Return the number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
     place = step.world.cell.wrapped(step.world.grains.position)
     return step.total(count_outside(place, np.asarray(low, float), np.asarray(high, float)))
 
@@ -99,7 +99,7 @@ SUNK = 1e-3  #: a rise of the energy is none if bodies would get it by sinking f
 
 
 def energy_balance(step: Step) -> dict[str, float]:
-    """Energies at the end of the step and where their change came from [J].
+    """Return energies at the end of the step and where their change came from [J].
 
         change of kinetic + potential + spring = work of motions and of cohesion - friction loss - impact loss
                                                  + time stepping
@@ -112,7 +112,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
 
     Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be, but hold
-    no more than impulses have loaded them with (`dem.start.stiffness.spring_energies`). What they lose or gain
+    no more than impulses have loaded them with (`dem.start.stiffness.elastic_energies`). What they lose or gain
     between two steps is in no term: the spring energy of a step less that before the next.
 
     The jump is the rise of the kinetic energy in a step in which it rises by more than the work of motions, gravity
@@ -131,7 +131,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     velocity[first:][~moves] = world.large.velocity[~moves]
     mean = 0.5 * (velocity[first:] + world.large.velocity)
     normal, tangential, opening = works(step, step.in_cone, velocity, step.moment)
-    elastic, elastic_at_end, strained, strained_at_end = spring_energies(step, velocity, opening)
+    elastic, elastic_at_end, strained, strained_at_end = elastic_energies(step, velocity, opening)
     attracted = 0.0 if system.attraction is None else works(step, step.impulse, velocity)[0] - normal
     applied = belts = flow = 0.0
     if system.applied is not None:
@@ -190,8 +190,8 @@ def _summed(comm: MPI.Comm, **numbers: float) -> dict[str, float]:
 def works(
     step: Step, impulse: Floats, before: Floats, moment: Floats | None = None
 ) -> tuple[float, float, Floats]:
-    """The work of this rank's normal impulses, and of its tangential ones and moments (nc, 3), on the mean of the
-    velocities `before` (rows, 6), of all rows of `near`, and of those after the step [J]; and the normal velocities
+    """Return the work of this rank's normal impulses, and of its tangential ones and moments (nc, 3), on the mean of
+    the velocities `before` (rows, 6), of all rows of `near`, and of those after the step [J]; and the normal velocities
     (nc,) of the latter; collective."""
     system, near = step.system, step.contacts.near
     after = np.zeros(before.shape)
@@ -208,16 +208,16 @@ def works(
     return normal, tangential, opening
 
 
-def spring_energies(step: Step, before: Floats, opening: Floats) -> tuple[float, float, float, float]:
-    """`dem.start.stiffness.spring_energies` of a step, with the velocities `before` (rows, 6) and the normal velocities
-    `opening` (nc,) of its end."""
+def elastic_energies(step: Step, before: Floats, opening: Floats) -> tuple[float, float, float, float]:
+    """Return `dem.start.stiffness.elastic_energies` of a step, with the velocities `before` (rows, 6) and the normal
+    ones of its end `opening` (nc,)."""
     system, contacts = step.system, step.contacts
     came = system.contact_map.relative_velocities(before)[:, 0]
     if system.drift is not None:
         came = came + system.drift[:, 0]
     gaps = contacts.gap - system.dt * came, contacts.gap, contacts.linear_gap + system.dt * opening
     held = system.last, system.held, step.in_cone
-    return stiffness.spring_energies(system.stiffness, system.compliance, system.dt, *gaps, *held)
+    return stiffness.elastic_energies(system.stiffness, system.compliance, system.dt, *gaps, *held)
 
 
 def _still(table: Bodies, gravity: Floats, dt: float) -> tuple[float, float]:
@@ -283,7 +283,7 @@ def _carried(step: Step, prescribed: Bools) -> float:
     velocity = np.where(prescribed[:, None], step.world.large.velocity, 0.0)
     if not velocity.any():
         return 0.0
-    near, arm = step.contacts.near, step.system.contact_map.given.arm
+    near, arm = step.contacts.near, step.system.contact_map.source.arm
     first, mass = near.grains + near.ghosts, near.bodies.mass
     return carried_energy(velocity, first, mass, step.contacts.a, step.contacts.b, arm)
 
@@ -309,8 +309,8 @@ def carried_energy(velocity: Floats, first: int, mass: Floats, a: Ints, b: Ints,
 
 
 def contact_statistics(step: Step) -> dict[str, float]:
-    """Statistics of the contacts: how many there are, how many bear forces and slide. Overlaps are those at the start
-    of the step.
+    """Return statistics of the contacts: how many there are, how many bear forces and slide. Overlaps are those at the
+    start of the step.
 
     A contact is active if its normal impulse exceeds 1 % of the mean, as solvers leave small impulses at others. It
     slides if its tangential impulse is 99 % of what friction can bear, or more. The coordination number is the mean

@@ -11,7 +11,7 @@ from dem.arrays import Bools, Floats
 
 
 def low_pass(time: Floats, values: Floats, cutoff: float) -> Floats:
-    """Values (n,) at equally spaced times (n,) [s], without their parts of higher frequency than `cutoff` [Hz].
+    """Return values (n,) at equally spaced times (n,) [s], without their parts of higher frequency than `cutoff` [Hz].
 
     Butterworth filter of second order, forwards and backwards, so that nothing is shifted in time. The series goes on
     beyond its ends, mirrored at the end points, for as long as the filter remembers. The values come back unchanged if
@@ -30,7 +30,7 @@ def low_pass(time: Floats, values: Floats, cutoff: float) -> Floats:
 
 
 def filtered(records: Mapping[str, Floats], names: list[str], cutoff: float) -> dict[str, Floats]:
-    """The named records through `low_pass`, under the names "force_filtered [N]" and the like."""
+    """Return the named records through `low_pass`, under the names "force_filtered [N]" and the like."""
     out = {}
     for name in names:
         stem, bracket, unit = name.partition(" [")
@@ -39,10 +39,10 @@ def filtered(records: Mapping[str, Floats], names: list[str], cutoff: float) -> 
 
 
 def calm(records: Mapping[str, Floats]) -> Bools:
-    """Mask (n,) of the steps without a jump of energy (`dem.record.energy_balance`): means are of these."""
+    """Return the mask (n,) of the steps without a jump of energy (`dem.record.energy_balance`): means are of these."""
     return records["energy_jump [J]"] == 0.0
 
 
 def friction_angle(shear: Floats, normal: Floats) -> float:
-    """Angle [degrees] whose tangent is the mean shear over the mean normal stress."""
+    """Return the angle [degrees] whose tangent is the mean shear over the mean normal stress."""
     return float(np.degrees(np.arctan2(np.mean(shear), np.mean(normal))))

@@ -16,7 +16,8 @@ from dem.geometry.insertion import inserted
 from dem.model.neighbourhood import Neighbourhood, seen_by
 from dem.model.partition import redistribute
 from dem.model.world import World
-from dem.parts.sources import MOST_IDS, Source, bounds, reach
+from dem.parts.passages import MOST_IDS
+from dem.parts.sources import Source, bounds, reach
 from dem.record.energies import energy
 from dem.together import SceneError
 
@@ -129,8 +130,8 @@ def _free(world: World, place: Floats, radius: Floats) -> Bools:
     free = np.ones(place.shape[:2], bool)
     if not len(world.large) or not free.size:
         return free
-    for way in world.cell.image_vectors:
-        free &= _apart(world, place.reshape(-1, 3) + way, np.repeat(radius, place.shape[1])).reshape(free.shape)
+    for vector in world.cell.image_vectors:
+        free &= _apart(world, place.reshape(-1, 3) + vector, np.repeat(radius, place.shape[1])).reshape(free.shape)
     return free
 
 
@@ -148,11 +149,11 @@ def _apart(world: World, center: Floats, radius: Floats) -> Bools:
     parts = primitives(near, [body.shapes for body in world.large_bodies], count, world.forms).now(near)
     i, j = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for part in range(count, len(parts.kind)):
-        way = center - parts.center[part]
+        offset = center - parts.center[part]
         if parts.kind[part] == PLANE:
-            rows = np.flatnonzero(way @ parts.size[part] <= radius)
+            rows = np.flatnonzero(offset @ parts.size[part] <= radius)
         else:
-            rows = np.flatnonzero((way**2).sum(axis=1) <= (radius + parts.radius[part]) ** 2)
+            rows = np.flatnonzero((offset**2).sum(axis=1) <= (radius + parts.radius[part]) ** 2)
         i.append(rows)
         j.append(np.full(len(rows), part))
     one, other = np.concatenate(i), np.concatenate(j)

@@ -92,7 +92,7 @@ class Clump:
 
 
 def described(shape: Shape) -> dict[str, Any]:
-    """The kind of a shape and its parameters by name."""
+    """Return the kind of a shape and its parameters by name."""
     if isinstance(shape, Mesh):
         names = ("vertices", "triangles", "center", "quaternion")
         return {"kind": "Mesh", **{name: np.asarray(getattr(shape, name)).tolist() for name in names}}
@@ -101,9 +101,9 @@ def described(shape: Shape) -> dict[str, Any]:
 
 
 def placed(shape: Shape) -> tuple[int, Floats, Floats, Floats]:
-    """Kind, centre (3,), quaternion (4,) and size (3,), as of `Bodies`, of a shape in the frame of its body; of a mesh
-    those of the box about it, and as the size of a half space its normal. The kind of a convex shape is CONVEX, without
-    the number of its form."""
+    """Return kind, centre (3,), quaternion (4,) and size (3,), as of `Bodies`, of a shape in the frame of its body; of
+    a mesh those of the box about it, and as the size of a half space its normal. The kind of a convex shape is CONVEX,
+    without the number of its form."""
     center, turn = np.array(shape.center), np.array(getattr(shape, "quaternion", (1.0, 0.0, 0.0, 0.0)))
     if isinstance(shape, Plane):
         return PLANE, center, turn, np.array(shape.normal)
@@ -119,7 +119,8 @@ def placed(shape: Shape) -> tuple[int, Floats, Floats, Floats]:
 
 
 def solid(kind: int, size: Floats, density: Floats) -> tuple[Floats, Floats]:
-    """Masses (n,) and principal moments (n, 3) of solid boxes, spheres or capsules of sizes (n, 3) and densities (n,).
+    """Return masses (n,) and principal moments (n, 3) of solid boxes, spheres or capsules of sizes (n, 3) and densities
+    (n,).
 
     A capsule is a cylinder and two half balls, each with its centre of mass 3/8 radius off its base; a sphere is a
     capsule of length zero.
@@ -137,8 +138,8 @@ def solid(kind: int, size: Floats, density: Floats) -> tuple[Floats, Floats]:
 
 
 def solid_properties(shape: Shape, density: float) -> tuple[float, Floats, Floats]:
-    """Mass, centre of mass (3,) and inertia tensor (3, 3) about it of one shape, in the body frame; ValueError as of
-    `mass_properties`."""
+    """Return the mass, centre of mass (3,) and inertia tensor (3, 3) about it of one shape, in the body frame;
+    ValueError as of `mass_properties`."""
     kind, place, turn, size = placed(shape)
     frame = quaternion.matrix(turn)
     if isinstance(shape, Plane):
@@ -154,7 +155,7 @@ def solid_properties(shape: Shape, density: float) -> tuple[float, Floats, Float
 
 
 def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Floats, Floats]:
-    """Mass, centre of mass (3,) and inertia tensor (3, 3) about it, in the body frame.
+    """Return the mass, centre of mass (3,) and inertia tensor (3, 3) about it, in the body frame.
 
     Volumes that shapes share count once for each of them. ValueError for half spaces and for meshes that are open or
     have their normals inwards: they have no mass.
@@ -169,11 +170,11 @@ def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Flo
 
 
 def moved(shape: Shape, center: Floats, turn: Floats) -> Shape:
-    """The shape in a frame with origin `center` (3,) and orientation `turn` (4,) in the present one."""
-    back = quaternion.conjugate(turn)
-    changes: dict[str, Any] = {"center": quaternion.rotate(back, np.array(shape.center) - center)}
+    """Return the shape in a frame with origin `center` (3,) and orientation `turn` (4,) in the present one."""
+    inverse_turn = quaternion.conjugate(turn)
+    changes: dict[str, Any] = {"center": quaternion.rotate(inverse_turn, np.array(shape.center) - center)}
     if isinstance(shape, Plane):
-        changes["normal"] = quaternion.rotate(back, np.array(shape.normal))
+        changes["normal"] = quaternion.rotate(inverse_turn, np.array(shape.normal))
     elif not isinstance(shape, Sphere):
-        changes["quaternion"] = quaternion.multiply(back, np.array(shape.quaternion))
+        changes["quaternion"] = quaternion.multiply(inverse_turn, np.array(shape.quaternion))
     return replace(shape, **changes)

@@ -69,8 +69,8 @@ def _solid(vertices: tuple[tuple[float, ...], ...]) -> Solid:
     faces = hull(given - middle)
     volume, place, tensor = integrals(faces)
     moments, turn = quaternion.principal(tensor)
-    back = quaternion.conjugate(turn)
-    own = quaternion.rotate(back, faces.vertex - place), quaternion.rotate(back, faces.normal)
+    inverse_turn = quaternion.conjugate(turn)
+    own = quaternion.rotate(inverse_turn, faces.vertex - place), quaternion.rotate(inverse_turn, faces.normal)
     return Solid(volume, moments, place + middle, turn, Faces(*own, *faces[2:]))
 
 

@@ -57,20 +57,20 @@ def _support(numbers, skin, x, y, z):
 @loop
 def _face(numbers, x, y, z, point, name):
     """Four points of a side that is flat both ways, two of one that is flat one way."""
-    way, axis = (x, y, z), 0
+    direction, axis = (x, y, z), 0
     for k in range(3):
-        axis = k if abs(way[k]) > abs(way[axis]) else axis
+        axis = k if abs(direction[k]) > abs(direction[axis]) else axis
     one, two = (axis + 1) % 3, (axis + 2) % 3
     flat_one = numbers[3 if axis == 2 or one == 2 else 4] > 2.0
     flat_two = numbers[3 if axis == 2 or two == 2 else 4] > 2.0
-    if abs(way[axis]) < FACING * np.sqrt(x * x + y * y + z * z) or not (flat_one or flat_two):
+    if abs(direction[axis]) < FACING * np.sqrt(x * x + y * y + z * z) or not (flat_one or flat_two):
         return 1, 0.0
     count = 4 if flat_one and flat_two else 2
     for k in range(count):
         ahead, beside = 2 * (k in (1, 2)) - 1, 2 * (k > 1) - 1
         for n in range(3):
             name[k], point[k, n] = k, 0.0
-        point[k, axis] = np.copysign(1.0, way[axis])
+        point[k, axis] = np.copysign(1.0, direction[axis])
         point[k, one] = TILT * ahead if flat_one else 0.0
         point[k, two] = TILT * (beside if flat_one else ahead) if flat_two else 0.0
         point[k, 0], point[k, 1], point[k, 2] = _support(numbers, 0.0, point[k, 0], point[k, 1], point[k, 2])
@@ -90,11 +90,11 @@ def _arc(numbers, x, y, z):
 
 
 @loop
-def supports(numbers: Floats, way: Floats) -> Floats:
+def supports(numbers: Floats, direction: Floats) -> Floats:
     """The points (n, 3) that are furthest along vectors (n, 3)."""
-    out = np.empty_like(way)
-    for k in range(len(way)):
-        out[k, 0], out[k, 1], out[k, 2] = _support(numbers, 0.0, way[k, 0], way[k, 1], way[k, 2])
+    out = np.empty_like(direction)
+    for k in range(len(direction)):
+        out[k, 0], out[k, 1], out[k, 2] = _support(numbers, 0.0, direction[k, 0], direction[k, 1], direction[k, 2])
     return out
 
 
@@ -146,11 +146,11 @@ class Superellipsoid(Convex):
         """As of `Convex`: by differences of supports in directions of an octant; the others are alike."""
         angle = np.linspace(0.0, 0.5 * np.pi, GRID + 1)
         up, round_z = (grid.ravel() for grid in np.meshgrid(angle, angle))
-        way = np.stack([np.cos(up) * np.cos(round_z), np.cos(up) * np.sin(round_z), np.sin(up)], axis=1)
+        direction = np.stack([np.cos(up) * np.cos(round_z), np.cos(up) * np.sin(round_z), np.sin(up)], axis=1)
         one = np.stack([-np.sin(round_z), np.cos(round_z), np.zeros(len(up))], axis=1)
-        two = np.cross(way, one)
+        two = np.cross(direction, one)
         numbers, small = np.array([*self.numbers, 0.0]), 1e-4
-        change = [(supports(numbers, way + small * t) - supports(numbers, way - small * t)) / (2.0 * small)
+        change = [(supports(numbers, direction + small * t) - supports(numbers, direction - small * t)) / (2.0 * small)
                   for t in (one, two)]  # fmt: skip
         aa, ab, bb = (np.einsum("ni,ni->n", s, t) for s, t in ((change[0], one), (change[0], two), (change[1], two)))
         least = 0.5 * (aa + bb) - np.hypot(0.5 * (aa - bb), ab)

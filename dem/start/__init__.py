@@ -21,7 +21,6 @@ from dem.model.partition import redistribute
 from dem.model.world import World
 from dem.parts.ends import Tie
 from dem.parts.named import Force
-from dem.parts.sources import Passages
 from dem.scene import Scene, kinds_of, least_half
 from dem.shapes.forms import Form
 from dem.start import stiffness
@@ -29,7 +28,7 @@ from dem.together import together
 
 
 def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
-    """The scene at time zero, distributed; collective.
+    """Return the scene at time zero, distributed; collective.
 
     Bodies of prescribed motion are where their motions put them at time zero. ValueError if nothing moves, or if
     bodies overlap by more than `overlap` half thicknesses (`refuse_overlap`); SceneError if a motion fails.
@@ -47,7 +46,7 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
 def restored_world(
     scene: Scene, comm: MPI.Comm, local: Mapping[str, np.ndarray], replicated: Mapping[str, np.ndarray]
 ) -> World:
-    """The world whose `World.state` was taken, for the same scene; collective.
+    """Return the world whose `World.state` was taken, for the same scene; collective.
 
     `local`: the rows `restart_rows` of every local array. If the number of ranks is that of the state, the restored
     world is the same to the last bit; otherwise the grains are distributed anew. ValueError on all ranks if the scene
@@ -122,14 +121,14 @@ def _is_of(table: Bodies, number: int, form: Form) -> bool:
 
 
 def restart_rows(slabs: Ints, comm: MPI.Comm) -> slice:
-    """Rows of a whole state's grain arrays that this rank hands to `restored_world`; slabs as in the state."""
+    """Return rows of a whole state's grain arrays that this rank hands to `restored_world`; slabs as in the state."""
     if len(slabs) == comm.size + 1:
         return slice(int(slabs[comm.rank]), int(slabs[comm.rank + 1]))
     return even_slice(int(slabs[-1]), comm)
 
 
 def even_slice(count: int, comm: MPI.Comm) -> slice:
-    """This rank's part of so many rows, in the order of the ranks."""
+    """Return this rank's part of so many rows, in the order of the ranks."""
     return slice(count * comm.rank // comm.size, count * (comm.rank + 1) // comm.size)
 
 
@@ -139,7 +138,7 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     world.named, world.cell = {kind: dict(members) for kind, members in scene.named.items()}, scene.cell
     world.forms = tuple(scene.forms)
     refuse_untouchable(scene.kinds, scene.large_bodies)
-    world.passages = Passages(world.named["source"], dict(scene.passages.outlets)).counted()
+    world.passages = scene.passages.counted(world.named["source"])
     world.initial, world.first_large = scene.count, scene.first_large
     number = {body.name: int(id) for body, id in zip(world.large_bodies, world.large.id)} | {None: -1}
     parts = [part for _, _, members in kinds_of(Tie, world.named) for part in members.values() if not part.touching]
@@ -152,8 +151,8 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
 
 
 def refuse_overlap(world: World, overlap: float) -> None:
-    """ValueError, on all ranks, that names the worst pair, its place and the number of such contacts, if bodies overlap
-    by more than `overlap` half thicknesses of the thinner one that forces move.
+    """Raise ValueError on all ranks that names the worst pair, its place and the number of such contacts, if bodies
+    overlap by more than `overlap` half thicknesses of the thinner one that forces move.
 
     Bodies at the ends of a part that do not touch each other may share a place, and so may those that no force can part
     (`held_overlap`)."""
@@ -178,8 +177,8 @@ def refuse_overlap(world: World, overlap: float) -> None:
 
 
 def step_remark(world: World, dt: float) -> str:
-    """What to say of a dt [s] that is too large for the grains as they are now, and a better one; empty if it is not;
-    collective.
+    """Return what to say of a dt [s] that is too large for the grains as they are now, and a better one; empty if it is
+    not; collective.
 
     A grain should not fall by more than its diameter from rest, dt <= sqrt(d / g), nor go further than two radii.
     """

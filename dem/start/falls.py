@@ -59,7 +59,7 @@ def fall(scene: Scene, acceleration: Floats, start: float = 0.0) -> Fall:
         lasts += [_longest_path(corners, along, planes, levels) - bed, first + half]
     elif not lasts:  # large bodies alone: the highest falls on all others
         lasts = [_longest_path(every.position, along, planes, levels) - 2.0 * float(halves.sum() - half)]
-    squares = (start * start + 2.0 * size * max(way, 0.0) for way in (max(lasts) - half, first))
+    squares = (start * start + 2.0 * size * max(distance, 0.0) for distance in (max(lasts) - half, first))
     last, block = (math.sqrt(min(square, 1e300)) for square in squares)
     return Fall(last, block, gap, column)
 
@@ -72,8 +72,8 @@ def free_path(scene: Scene, body: LargeBody, along: Floats) -> float:
     if not corners or not (len(planes) or len(levels)):
         return 0.0
     place = np.concatenate(corners)
-    ways = _to_planes(place, along, planes) if len(planes) else levels.max() - place @ along
-    return max(float(ways.min()), 0.0)
+    distances = _to_planes(place, along, planes) if len(planes) else levels.max() - place @ along
+    return max(float(distances.min()), 0.0)
 
 
 def area(scene: Scene, along: Floats) -> float:
@@ -131,8 +131,9 @@ def _longest_path(place: Floats, along: Floats, planes: Floats, levels: Floats) 
 
 def _shortest_path(place: Floats, along: Floats, planes: Floats, levels: Floats) -> float:
     """The shortest way from places (n, 3) to a half space or to a part of a body beyond all of them."""
-    ways = np.append(levels - (place @ along).max(), _to_planes(place, along, planes).min())
-    return float(ways[ways >= 0.0].min(initial=np.inf)) if np.isfinite(ways[ways >= 0.0]).any() else 0.0
+    distances = np.append(levels - (place @ along).max(), _to_planes(place, along, planes).min())
+    ahead = distances[distances >= 0.0]
+    return float(ahead.min(initial=np.inf)) if np.isfinite(ahead).any() else 0.0
 
 
 def _ends(scene: Scene, along: Floats, besides: LargeBody | None = None) -> tuple[Floats, Floats]:

@@ -65,8 +65,8 @@ def _tools(scene: Scene, pushes: Sequence[tuple[str, Floats, float]]) -> Pressin
             continue
         greatest = max(greatest, share * size)
         if share == 1.0 and force.any():
-            way = max(free_path(scene, body, along) - (2.0 * radius if count else 0.0), 0.0)
-            speed = math.sqrt(2.0 * size / body.mass * way)
+            distance = max(free_path(scene, body, along) - (2.0 * radius if count else 0.0), 0.0)
+            speed = math.sqrt(2.0 * size / body.mass * distance)
             if isinstance(motion, Guided) and motion.speed is not None and motion.force >= body.mass * falls:
                 speed = min(speed, abs(motion.speed))  # which the servo keeps
             impacts.append((body.mass, speed))

@@ -52,14 +52,14 @@ DAMPING = 2.0  #: c as a part of 2 sqrt(k m): an impact leaves 5 % of the speed 
 
 
 def pairs(scene: Scene) -> ContactLaw:
-    """The coefficients of contacts by pair of materials, with the recommended stiffness where none is stated."""
+    """Return the coefficients of contacts by pair of materials, with the recommended stiffness where none is stated."""
     return scene.pairs(recommended(scene))
 
 
 def recommended(scene: Scene) -> float:
-    """The stiffness [N/m] with which no grain of a scene overlaps by more than OVERLAP half thicknesses, whether under
-    the weight of the bed above it, pressed by a spring, a load, a motor or a tool, pushed by the fastest tool or met by
-    the fastest grain, nor by more than FALLEN of them after a fall, to two digits; inf if there is none of them.
+    """Return the stiffness [N/m] with which no grain of a scene overlaps by more than OVERLAP half thicknesses, whether
+    under the weight of the bed above it, pressed by a spring, a load, a motor or a tool, pushed by the fastest tool or
+    met by the fastest grain, nor by more than FALLEN of them after a fall, to two digits; inf if there is none of them.
 
     The weight on a grain is that of all bodies over the area of the bed, times the square of the grain's width, and
     four times as much where a chain of force goes (Radjai, Jean, Moreau, Roux, Phys. Rev. Lett. 77 (1996): a share of
@@ -85,8 +85,8 @@ def recommended(scene: Scene) -> float:
 
 
 def expected_overlap(scene: Scene, stiffness: float, dt: float) -> float:
-    """The greatest overlap, as a part of a half thickness, that `recommended` would expect of a stiffness [N/m] in
-    steps of dt [s]."""
+    """Return the greatest overlap, as a part of a half thickness, that `recommended` would expect of a stiffness [N/m]
+    in steps of dt [s]."""
     if np.isinf(stiffness):
         return 0.0
     grains, pressed = scene.expected(), pressing(scene)
@@ -100,7 +100,7 @@ def expected_overlap(scene: Scene, stiffness: float, dt: float) -> float:
 
 
 def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:
-    """The stiffness E R [N/m] of the contact of two equal spheres of Young's modulus E [Pa] and radius R [m].
+    """Return the stiffness E R [N/m] of the contact of two equal spheres of Young's modulus E [Pa] and radius R [m].
 
     Source: the linear law of Yade (Smilauer et al., documentation of `Ip2_FrictMat_FrictMat_FrictPhys`), for equal
     spheres; for others take the harmonic mean of E R of both."""
@@ -138,13 +138,13 @@ def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float, 
     stiffness [N/m] and the reduced mass of its bodies [kg]; 0, 0 and 1 of a rigid one."""
     if np.isinf(stiffness):
         return 0.0, 0.0, 1.0
-    spring = stiffness * dt**2
-    C = 1.0 / (spring + 2.0 * DAMPING * np.sqrt(stiffness * mass) * dt)
-    return C, C / TANGENTIAL, spring * C
+    elastic = stiffness * dt**2
+    C = 1.0 / (elastic + 2.0 * DAMPING * np.sqrt(stiffness * mass) * dt)
+    return C, C / TANGENTIAL, elastic * C
 
 
 @loop
-def subtract_tangential_springs(r: Floats, compliance: Floats, held: Floats) -> None:
+def subtract_held_impulses(r: Floats, compliance: Floats, held: Floats) -> None:
     """Take from r (nc, 3) what tangential springs give that held these impulses (nc, 2) before the step."""
     for c in range(len(r)):
         for k in range(2):
@@ -158,13 +158,13 @@ def held_after(stiffness: Floats, compliance: Floats, dt: float, held: Floats, i
     out = np.empty((len(impulse), 3))
     for c in range(len(held)):
         out[c, 0] = impulse[c, 0]
-        out[c, 1], out[c, 2] = _held_by_springs(stiffness, compliance, dt, held, impulse, c)
+        out[c, 1], out[c, 2] = _held_after(stiffness, compliance, dt, held, impulse, c)
     out[len(held) :] = impulse[len(held) :]
     return out
 
 
 @inlined
-def _held_by_springs(stiffness, compliance, dt, held, impulse, c):
+def _held_after(stiffness, compliance, dt, held, impulse, c):
     share = 1.0 if np.isinf(stiffness[c]) else stiffness[c] * dt**2 * compliance[c, 0]
     one = held[c, 0] + share * (impulse[c, 1] - held[c, 0]) if share > 0.0 else 0.0
     other = held[c, 1] + share * (impulse[c, 2] - held[c, 1]) if share > 0.0 else 0.0
@@ -172,7 +172,7 @@ def _held_by_springs(stiffness, compliance, dt, held, impulse, c):
 
 
 @loop
-def spring_energies(
+def elastic_energies(
     stiffness: Floats, compliance: Floats, dt: float, past: Floats, gap: Floats, after: Floats, last: Floats,
     held: Floats, impulse: Floats,
 ) -> tuple[float, float, float, float]:  # fmt: skip
@@ -190,7 +190,7 @@ def spring_energies(
         k, per = stiffness[c], TANGENTIAL * stiffness[c] * dt**2
         start += 0.5 * k * _loaded_overlap(k, compliance[c, 0], dt, past[c], gap[c], last[c]) ** 2
         end += 0.5 * k * _loaded_overlap(k, compliance[c, 0], dt, gap[c], after[c], impulse[c, 0]) ** 2
-        one, other = _held_by_springs(stiffness, compliance, dt, held, impulse, c)
+        one, other = _held_after(stiffness, compliance, dt, held, impulse, c)
         strained += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / per
         strained_at_end += 0.5 * (one**2 + other**2) / per
     return start, end, strained, strained_at_end
@@ -220,9 +220,9 @@ def _impacts(scene: Scene, pressed: Pressing, dt: float) -> list[tuple[Floats, f
 def _stopping(mass: Floats, speed: float, layers: float, dt: float, allowed: Floats) -> Floats:
     """The stiffness (n,) that stops these masses within the overlaps `allowed` (n,): the other way round as
     `_stopped`."""
-    ways = layers * speed * dt / allowed
-    x = np.sqrt(np.maximum(4.0 - layers + ways, 0.0)) - 2.0
-    return mass * (np.where(x > 1.0, x, np.minimum(STOPPED * ways / layers, 1.0)) / dt) ** 2
+    travel = layers * speed * dt / allowed
+    x = np.sqrt(np.maximum(4.0 - layers + travel, 0.0)) - 2.0
+    return mass * (np.where(x > 1.0, x, np.minimum(STOPPED * travel / layers, 1.0)) / dt) ** 2
 
 
 def _stopped(mass: Floats, speed: float, layers: float, dt: float, stiffness: float) -> Floats:

@@ -29,14 +29,14 @@ PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same an
 
 
 def recommended(scene: Scene) -> float:
-    """The time step [s] with which forces on tools are within a few per cent of those of smaller steps, grains that
-    fall go no further than FALLS of their half thicknesses, and bodies that are no spheres turn by no more than TURN at
-    time zero, to two digits; 0.01 s for a scene without all that."""
+    """Return the time step [s] with which forces on tools are within a few per cent of those of smaller steps, grains
+    that fall go no further than FALLS of their half thicknesses, and bodies that are no spheres turn by no more than
+    TURN at time zero, to two digits; 0.01 s for a scene without all that."""
     return min(needs(scene).values())
 
 
 def needs(scene: Scene) -> dict[str, float]:
-    """The time steps [s] that a scene needs, by what needs them."""
+    """Return the time steps [s] that a scene needs, by what needs them."""
     found = {"grains that come to rest": for_settling(scene)}
     speed, pressed = fastest(scene), pressing(scene)
     pushed = max(math.hypot(*acceleration) for acceleration in pressed.accelerations)
@@ -54,14 +54,14 @@ def needs(scene: Scene) -> dict[str, float]:
 
 
 def reason(scene: Scene) -> str:
-    """What the recommended time step is for."""
+    """Return what the recommended time step is for."""
     found = needs(scene)
     return min(found, key=lambda name: found[name])
 
 
 def fall_remark(scene: Scene, dt: float) -> str:
-    """What to say of a dt [s] in which grains that fall go so far that `dem.step.fast` may end the run; empty if none
-    do."""
+    """Return what to say of a dt [s] in which grains that fall go so far that `dem.step.fast` may end the run; empty if
+    none do."""
     speed, size = falling(scene, pressing(scene)), smallest(scene)
     if dt * speed <= 2.0 * size:
         return ""
@@ -70,45 +70,45 @@ def fall_remark(scene: Scene, dt: float) -> str:
 
 
 def falling(scene: Scene, pressed: Pressing) -> float:
-    """The greatest speed with which a grain may meet a body or the bed, by gravity and loads [m/s]."""
+    """Return the greatest speed with which a grain may meet a body or the bed, by gravity and loads [m/s]."""
     start = fastest_grain(scene)
     return max(fall(scene, acceleration, start).last for acceleration in pressed.accelerations)
 
 
 def for_settling(scene: Scene) -> float:
-    """The time step [s] in which grains fall and come to rest; 0.01 s without gravity."""
+    """Return the time step [s] in which grains fall and come to rest; 0.01 s without gravity."""
     return _rounded(FALLING * _fall(scene))
 
 
 def contact_distance(scene: Scene) -> float:
-    """The gap [m] below which a pair of bodies is a contact. What moves further within a step has a margin of its own,
-    see `dem.contact.search`. Cohesion has a range that it covers."""
+    """Return the gap [m] below which a pair of bodies is a contact. What moves further within a step has a margin of
+    its own, see `dem.contact.search`. Cohesion has a range that it covers."""
     return max(smallest(scene) / PARTS, scene.reach)
 
 
 def smallest(scene: Scene) -> float:
-    """Half thickness of the thinnest grain [m]; 0.1 m if there is none."""
+    """Return the half thickness of the thinnest grain [m]; 0.1 m if there is none."""
     half: Floats = bodies.least_half_thickness(scene.expected())
     return float(half.min()) if len(half) else 0.1
 
 
 def fastest(scene: Scene) -> float:
-    """The greatest speed of a tool, or of a grain at time zero [m/s]."""
+    """Return the greatest speed of a tool, or of a grain at time zero [m/s]."""
     return max(fastest_tool(scene), fastest_grain(scene))
 
 
 def fastest_tool(scene: Scene) -> float:
-    """The greatest speed of a large body that stays with the grains [m/s]."""
+    """Return the greatest speed of a large body that stays with the grains [m/s]."""
     return max((_top_speed(body) for body in scene.large_bodies if body.name not in scene.leaving), default=0.0)
 
 
 def fastest_grain(scene: Scene) -> float:
-    """The greatest speed of a grain at time zero [m/s]; in a sheared cell beside the flow."""
+    """Return the greatest speed of a grain at time zero [m/s]; in a sheared cell beside the flow."""
     return float(scene.speeds(scene.expected()).max(initial=0.0))
 
 
 def fastest_turn(scene: Scene) -> float:
-    """The greatest angular speed at time zero of a body that is no sphere and that forces move [rad/s]."""
+    """Return the greatest angular speed at time zero of a body that is no sphere and that forces move [rad/s]."""
     grains, large = bodies.turning(scene.expected()), turning_of_large(scene.large(), scene.large_bodies)
     return float(np.concatenate([grains, large]).max(initial=0.0))
 

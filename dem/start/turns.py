@@ -7,15 +7,18 @@ of second order in the angle of a step. Spheres may turn as fast as they will.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats
 from dem.exchange import greatest
-from dem.model.world import World, turns_unlike_spheres
-from dem.scene import LargeBody
 from dem.shapes import Sphere
+
+if TYPE_CHECKING:
+    from dem.model.world import World
+    from dem.scene import LargeBody
 
 TURN = 0.2  #: the greatest angle [rad] by which bodies that are no spheres should turn in a step
 SLACK = 1.1  #: times that is told: a body that tumbles freely turns faster at times
@@ -40,7 +43,7 @@ class TurnWatch:
 
     def look(self, world: World, dt: float) -> str:
         """What to say of a dt [s] for the world as it is now, most often nothing; collective."""
-        if self._told or not turns_unlike_spheres(world):
+        if self._told or not world.turns_unlike_spheres:
             return ""
         speeds = np.concatenate([bodies.turning(world.grains), turning_of_large(world.large, world.large_bodies)])
         ids = np.concatenate([world.grains.id, world.large.id])

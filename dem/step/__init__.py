@@ -112,7 +112,7 @@ class Step:
         if contacts.moved is not None:
             center[:, 1] += contacts.moved
             center += (self.point - contacts.point)[:, None]
-        way, drift = self.world.cell.lattice
+        vectors, drift = self.world.cell.lattice
         number, first, count = near.id[pair], self.world.first_large, self.world.ids
         names = ("id", "position", "velocity", "mass", "shape", "size", "material")
         return Sample(
@@ -127,7 +127,7 @@ class Step:
             gap=contacts.gap,
             force=self.force,
             moment=self.moments,
-            lattice=way,
+            lattice=vectors,
             drift=drift,
         )
 
@@ -169,7 +169,7 @@ def advance(
 
 
 def advanced(world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats) -> World:
-    """The world that `advance` leads to; this one stays as it is. Collective."""
+    """Return the world that `advance` leads to; this one stays as it is. Collective."""
     after = world.trial()
     advance(after, free, contacts, velocity)
     return after
@@ -185,23 +185,23 @@ def find_overrun(
     world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats, delta: float, depth: float,
     recovery_speed: float,
 ) -> Contacts | None:  # fmt: skip
-    """The contacts of wider margins, if with these velocities (owned, 6) bodies go further in the step than their
-    margins in the search for `contacts`, and overlap by more than `depth` [m] with others that it has not seen. None if
-    none do; collective.
+    """Return the contacts of wider margins, if with these velocities (owned, 6) bodies go further in the step than
+    their margins in the search for `contacts`, and overlap by more than `depth` [m] with others that it has not seen.
+    None if none do; collective.
 
     The search may be repeated for the contacts that it finds: margins only grow.
     """
     dt, seen = free.dt, contacts.near.margin[: contacts.near.grains]
-    way = greatest_travel(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
-    way = way + world.cell.margin(dt, world.grains)
+    travel = greatest_travel(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
+    travel = travel + world.cell.margin(dt, world.grains)
     large = large_velocity(world, free, velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
-    gone = bool((way > seen).any()), exceeds_margin(world, dt * large, contacts.shifts, delta)
+    gone = bool((travel > seen).any()), exceeds_margin(world, dt * large, contacts.shifts, delta)
     further, beyond = on_any(world.comm, *gone)
     if not (further or beyond):
         return None
     shifts = np.concatenate([contacts.shifts, dt * large[None]]) if beyond else contacts.shifts
-    margin = np.maximum(seen, way)
+    margin = np.maximum(seen, travel)
     unseen = find_contacts(world, delta, free, margin, shifts, contacts.lists, besides=contacts)
     table = velocities_about(unseen, velocity, large)
     opening = _opening(world, unseen, unseen.near.bodies.position, table)
@@ -312,8 +312,8 @@ def _at_start(world: World, end: Contacts, velocity: Floats, dt: float) -> tuple
         start = replace(start, point=start.point - 0.5 * dt * flow, moved=end.moved - dt * flow)
     growth = dt * _opening(world, start, position, velocity)
     if world.cell.deforms and start.moved is not None:
-        way = dt * world.cell.rate * position  # of the centres, which the cell takes with it
-        start = replace(start, point=start.point - way[end.a], moved=start.moved + way[end.b] - way[end.a])
+        shift = dt * world.cell.rate * position  # of the centres, which the cell takes with it
+        start = replace(start, point=start.point - shift[end.a], moved=start.moved + shift[end.b] - shift[end.a])
     return replace(start, gap=end.gap - growth), growth
 
 
@@ -328,7 +328,8 @@ def _rows_in(contacts: Contacts, end: Contacts) -> tuple[Ints, Ints, Bools]:
 
 
 def carried(world: World, contacts: Contacts, wider: Contacts) -> Contacts:
-    """The contacts of a wider search, where they are among these as these: `find_turned` has linearised some anew."""
+    """Return the contacts of a wider search, where they are among these as these: `find_turned` has linearised some
+    anew."""
     a, b, known = _rows_in(wider, contacts)
     kept = replace(contacts, a=a, b=b, near=wider.near, shifts=wider.shifts).take(known)
     return _joined(world, wider.take(places(kept.key, wider.key) < 0), kept)

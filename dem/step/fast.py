@@ -43,8 +43,8 @@ def refuse_passages(
         return
     (count,), (furthest,) = reduced(world.comm, (here,), (own,))
     speed = length(velocity[: len(grains), :3])
-    way = dt * speed
-    fast = (way > most) & np.isfinite(way)
+    travel = dt * speed
+    fast = (travel > most) & np.isfinite(travel)
     lists, reach, seen = contacts.lists, 1.0, contacts.near.margin[: len(grains)]
     large = large_velocity(world, free, velocity)
     # where bodies are, not where they will be
@@ -56,7 +56,7 @@ def refuse_passages(
             row = int(np.argmax(np.where(fast, speed, 0.0))) if fast.any() else -1
             worst = (float(speed[row]), int(grains.id[row]), -1) if row >= 0 else worst
         else:
-            margin = np.where(fast, np.minimum(way, reach * most), 0.0)
+            margin = np.where(fast, np.minimum(travel, reach * most), 0.0)
             wide = find_contacts(world, delta, None, np.maximum(seen, margin), contacts.shifts, lists)
             lists, wide = wide.lists, wide.take(places(known, wide.key) < 0)
             table = velocities_about(wide, velocity, large)
@@ -80,9 +80,9 @@ def beyond(velocity: Floats, most: Floats, dt: float) -> tuple[int, float]:
     zero if none does."""
     count, furthest = 0, 0.0
     for n in range(len(most)):
-        way = dt * np.sqrt(velocity[n, 0] ** 2 + velocity[n, 1] ** 2 + velocity[n, 2] ** 2)
-        if way > most[n] and np.isfinite(way):
-            count, furthest = count + 1, max(furthest, way / most[n])
+        travel = dt * np.sqrt(velocity[n, 0] ** 2 + velocity[n, 1] ** 2 + velocity[n, 2] ** 2)
+        if travel > most[n] and np.isfinite(travel):
+            count, furthest = count + 1, max(furthest, travel / most[n])
     return count, furthest
 
 
@@ -94,17 +94,17 @@ def _meet(world: World, contacts: Contacts, table: Floats, delta: float, dt: flo
     spin = cross(table[row, 3:], arm)
     shape = near.bodies.shape[row]
     spin[shape == SPHERE] = 0.0  # their surfaces do not move
-    way = dt * (table[row, :3] + spin)
-    way = way[:, 1] - way[:, 0]
+    travel = dt * (table[row, :3] + spin)
+    travel = travel[:, 1] - travel[:, 0]
     if (flow := contacts.flow(world.cell, near.bodies.position)) is not None:
-        way += dt * flow
-    closes: Bools = contacts.linear_gap + np.einsum("ci,ci->c", way, contacts.normal) < -0.01 * delta
+        travel += dt * flow
+    closes: Bools = contacts.linear_gap + np.einsum("ci,ci->c", travel, contacts.normal) < -0.01 * delta
     balls = (shape == SPHERE).all(axis=1)
     radii = near.bodies.size[row[balls], 0].sum(axis=1)
     apart = contacts.branch(near.bodies.position)[balls]
-    square = np.maximum(length(way[balls]) ** 2, 1e-300)
-    share = -np.einsum("ci,ci->c", apart, way[balls]) / square
-    nearest = apart + np.clip(share, 0.0, 1.0)[:, None] * way[balls]
+    square = np.maximum(length(travel[balls]) ** 2, 1e-300)
+    share = -np.einsum("ci,ci->c", apart, travel[balls]) / square
+    nearest = apart + np.clip(share, 0.0, 1.0)[:, None] * travel[balls]
     closes[balls] = length(nearest) < radii - 0.01 * delta
     return closes
 

@@ -184,7 +184,7 @@ def struck(
             kind[c], meets[c] = WALL, closes and dot(v, n) < -slow
         elif ball[a] and ball[b] and (e > 0.0 or (many[a] == many[b] == 1 and _is_short(k, mass, a, b, dt))):
             offset[c] = image[c]
-            time, speed = _meeting(_way(place, a, b, offset, c), v, radius[a] + radius[b])
+            time, speed = _meeting(_branch(place, a, b, offset, c), v, radius[a] + radius[b])
             kind[c], meets[c] = PAIR, time <= dt and speed < -slow
             passes[c] = closes and not closed
         if meets[c]:
@@ -263,8 +263,8 @@ def followed(
             n = contact[c, 3], contact[c, 4], contact[c, 5]
             if met and contact[c, 12] == PAIR:
                 n = normal[c, 0], normal[c, 1], normal[c, 2]
-            way, v, _ = _relative(c, pair, contact, state, now)
-            far = plus(way, dt, v)
+            branch, v, _ = _relative(c, pair, contact, state, now)
+            far = plus(branch, dt, v)
             after[c], gap[c] = dot(v, n), contact[c, 9] + dot(far, n)
             if contact[c, 12] == PAIR:
                 gap[c] = np.sqrt(dot(far, far)) - state[pair[c, 0], 12] - state[pair[c, 1], 12]
@@ -278,7 +278,7 @@ def _is_short(stiffness, mass, a, b, dt):
 
 
 @inlined
-def _way(place, a, b, offset, c):
+def _branch(place, a, b, offset, c):
     """From body a to the image of body b in a contact c."""
     return (
         place[b, 0] + offset[c, 0] - place[a, 0],
@@ -288,10 +288,10 @@ def _way(place, a, b, offset, c):
 
 
 @inlined
-def _meeting(way, velocity, distance):
+def _meeting(branch, velocity, distance):
     """When two spheres with this way between their centres, and this relative velocity, are a distance apart, and the
     speed at which that grows then; infinite if never. Those that overlap meet at once."""
-    a, b, c = dot(velocity, velocity), dot(way, velocity), dot(way, way) - distance * distance
+    a, b, c = dot(velocity, velocity), dot(branch, velocity), dot(branch, branch) - distance * distance
     root = b * b - a * c
     if b >= 0.0 or root <= 0.0:
         return np.inf, 0.0
@@ -323,10 +323,11 @@ def _relative(c, pair, contact, state, now):
     centres, else what impacts change of it), the relative velocity in the end, and its change by forces."""
     a, b = pair[c, 0], pair[c, 1]
     if contact[c, 12] == PAIR:
-        way, v = _way(now, a, b, contact, c), (now[b, 3] - now[a, 3], now[b, 4] - now[a, 4], now[b, 5] - now[a, 5])
+        branch = _branch(now, a, b, contact, c)
+        v = now[b, 3] - now[a, 3], now[b, 4] - now[a, 4], now[b, 5] - now[a, 5]
         forced = state[b, 9] - state[a, 9], state[b, 10] - state[a, 10], state[b, 11] - state[a, 11]
     else:
-        way = (
+        branch = (
             now[b, 0] - state[b, 0] - now[a, 0] + state[a, 0],
             now[b, 1] - state[b, 1] - now[a, 1] + state[a, 1],
             now[b, 2] - state[b, 2] - now[a, 2] + state[a, 2],
@@ -337,7 +338,7 @@ def _relative(c, pair, contact, state, now):
             contact[c, 8] + now[b, 5] - state[b, 5] - now[a, 5],
         )
         forced = -state[a, 9], -state[a, 10], -state[a, 11]
-    return way, v, forced
+    return branch, v, forced
 
 
 @inlined
@@ -346,13 +347,13 @@ def _next(c, pair, contact, state, now, left, begin, dt, slow):
     a, b = pair[c, 0], pair[c, 1]
     if contact[c, 12] == OTHER or left[a] or (contact[c, 12] == PAIR and left[b]):
         return np.inf
-    way, v, forced = _relative(c, pair, contact, state, now)
+    branch, v, forced = _relative(c, pair, contact, state, now)
     if contact[c, 12] == PAIR:
-        later, speed = _meeting(plus(way, begin, v), v, state[a, 12] + state[b, 12])
+        later, speed = _meeting(plus(branch, begin, v), v, state[a, 12] + state[b, 12])
     else:  # the gap is gap + speed t + bend t^2 / 2, as forces act all the time
         n = contact[c, 3], contact[c, 4], contact[c, 5]
         bend, later = dot(forced, n) / dt, np.inf
-        gap, speed = contact[c, 9] + dot(way, n), dot(v, n) - 0.5 * dt * bend
+        gap, speed = contact[c, 9] + dot(branch, n), dot(v, n) - 0.5 * dt * bend
         gap, speed = gap + begin * (speed + 0.5 * begin * bend), speed + begin * bend
         root = speed * speed - 2.0 * bend * gap
         if root > 0.0 and (speed < 0.0 or bend < 0.0):
@@ -367,14 +368,14 @@ def _next(c, pair, contact, state, now, left, begin, dt, slow):
 def _bounce(c, pair, contact, state, now, time, dt):
     """Let the bodies of a contact bounce at a time, with friction; returns the normal."""
     a, b, of_two = pair[c, 0], pair[c, 1], contact[c, 12] == PAIR
-    way, v, forced = _relative(c, pair, contact, state, now)
+    branch, v, forced = _relative(c, pair, contact, state, now)
     n = contact[c, 3], contact[c, 4], contact[c, 5]
     r, s = state[a, 12], 0.0
     give, turn = 1.0 / state[a, 13], r * r / state[a, 14]
     if of_two:
-        way, s = plus(way, time, v), state[b, 12]
-        far = np.sqrt(dot(way, way))
-        n = way[0] / far, way[1] / far, way[2] / far
+        branch, s = plus(branch, time, v), state[b, 12]
+        far = np.sqrt(dot(branch, branch))
+        n = branch[0] / far, branch[1] / far, branch[2] / far
         give, turn = give + 1.0 / state[b, 13], turn + s * s / state[b, 14]
     v = plus(v, time / dt - 0.5, forced)
     v = plus(v, -r, cross((now[a, 6], now[a, 7], now[a, 8]), n))
@@ -400,7 +401,7 @@ def _bounce(c, pair, contact, state, now, time, dt):
 def _acts(c, pair, contact, state, now, dt, slow):
     """Whether a contact that is not followed closes in the step, faster than bodies at rest do; and whether its bodies
     are in impacts then, or it closes by them."""
-    way, v, _ = _relative(c, pair, contact, state, now)
+    branch, v, _ = _relative(c, pair, contact, state, now)
     n, most, loaded = (contact[c, 3], contact[c, 4], contact[c, 5]), 0.0, 0.0
     for side in range(2):
         body, sign, size = pair[c, side], -1.0 if side == 0 else 1.0, 0.0
@@ -409,7 +410,7 @@ def _acts(c, pair, contact, state, now, dt, slow):
             loaded += sign * change * n[k]
             size += change * change
         most = max(most, np.sqrt(size))
-    far = plus(way, dt, v)
+    far = plus(branch, dt, v)
     closes = contact[c, 9] + dot(far, n) < 0.0
     if contact[c, 12] == PAIR:
         closes = np.sqrt(dot(far, far)) < state[pair[c, 0], 12] + state[pair[c, 1], 12]

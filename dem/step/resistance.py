@@ -41,6 +41,6 @@ def resistance(
     turns = (1.0 / table.inertia[a] + 1.0 / table.inertia[b]).mean(axis=1)
     length = np.sqrt(np.divide(mobility, turns, out=np.ones(len(a)), where=(turns > 0.0) & (mobility > 0.0)))
     turn = (frame * length[:, None, None]).reshape(-1, 9)
-    G = TurningMap(known.comm, known.given, turn, known.halo, known.body, mass=known.mass)
+    G = TurningMap(known.comm, known.source, turn, known.halo, known.body, mass=known.mass)
     tangents, normals = (values / length for values in moments)
     return Resistance(G, length, (tangents, normals), G.turning(free))

@@ -45,6 +45,6 @@ def _velocity(body: LargeBody, arm: Floats, normal: Floats, turn: Floats) -> Flo
     """Velocities (n, 3) of the surface of a body in the world, at points with `arm` (n, 3) from its position."""
     given: Any = body.surface
     if callable(given):
-        back = quaternion.conjugate(turn)
-        given = given(quaternion.rotate(back, arm), quaternion.rotate(back, normal))
+        inverse_turn = quaternion.conjugate(turn)
+        given = given(quaternion.rotate(inverse_turn, arm), quaternion.rotate(inverse_turn, normal))
     return quaternion.rotate(turn, checks.rows(f"surface velocity of {body.name!r}", given, len(arm), 3))

@@ -31,7 +31,7 @@ from dem.contact_map.loops import closing, scale
 from dem.contact_map.mass import CellMass, ConstrainedMass
 from dem.contact_map.rows import packed
 from dem.free_motion import kept_spin
-from dem.model.world import World, turns_unlike_spheres
+from dem.model.world import World
 from dem.parts.laws import Solved
 from dem.start import stiffness
 from dem.step.laws import along_normal, contact_state
@@ -109,10 +109,11 @@ class ContactSystem:
         self.surface = surface_velocities(world, contacts, self.frame)
         self.take_flow(world, contacts)
         self.past = np.zeros((len(contacts), world.pairs.columns)) if kept is None else kept
-        self.met = contact_state(world, contacts, dt, self._slip(contacts)) if world.pairs.acting else None
-        pull = None if self.met is None else world.pairs.attraction(self.met, self.past)
+        state = contact_state(world, contacts, dt, self._slip(contacts)) if world.pairs.acting else None
+        self.contact_state = state
+        pull = None if state is None else world.pairs.attraction(state, self.past)
         self.attraction = None if pull is None else dt * pull
-        self.mu = contacts.friction if self.met is None else world.pairs.cone(self.met, self.past, contacts.friction)
+        self.mu = contacts.friction if state is None else world.pairs.cone(state, self.past, contacts.friction)
         self.friction = self.mu
         last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
         self.motion, change = self._linearised(world, motion, last)
@@ -127,7 +128,7 @@ class ContactSystem:
             self.b[:, 1:] = self.surface
         self.cell = cell_of(world, dt)
         if self.cell is not None:
-            mass = CellMass(world.comm, self.contact_map.given.root, self.cell)
+            mass = CellMass(world.comm, self.contact_map.source.root, self.cell)
             self.contact_map = self.contact_map.with_mass(mass)
             way = contacts.branch(near.bodies.position)
             freely += np.einsum("cij,cj->ci", self.frame, self.cell.free * way)
@@ -138,7 +139,7 @@ class ContactSystem:
             self._attracted = momentum = self.contact_map.momenta(along_normal(-self.attraction))
             self.free_velocity = self.velocity_with(momentum)
             freely += self.contact_map.velocities(momentum)
-        self.resistance = resistance(world, contacts, self.met, self.contact_map, self.frame, free)
+        self.resistance = resistance(world, contacts, state, self.contact_map, self.frame, free)
         self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
         if self.resistance is not None and self.attraction is not None:
             self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
@@ -156,7 +157,7 @@ class ContactSystem:
         if contacts.swing is not None:  # impacts last no step
             self.b[:, 1:] += np.where(impacts[:, None], 0.0, np.einsum("cij,cj->ci", self.frame[:, 1:], contacts.swing))
         self.r = _beyond(self.b, freely, rounding)
-        stiffness.subtract_tangential_springs(self.r, self.compliance, self.held)
+        stiffness.subtract_held_impulses(self.r, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
 
@@ -167,22 +168,22 @@ class ContactSystem:
         spheres, if it has none yet: that of the `last` impulses (nc, 3); and what the push changes of the velocities
         (owned, 6). Collective."""
         change, push = None, motion.push
-        if push is None and turns_unlike_spheres(world):
+        if push is None and world.turns_unlike_spheres:
             push = self.contact_map.momenta(self.net(last))
         if push is not None:
             change = np.empty(push.shape)
-            scale(self.contact_map.given.root, push, change)
+            scale(self.contact_map.source.root, push, change)
             struck = self.dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
             push[struck], change[struck] = 0.0, 0.0
         coupling = motion.coupling
         if coupling is None:
-            coupling = coupling_of(world, motion.applied, motion.given, self.dt, push)
+            coupling = coupling_of(world, motion.applied, motion.motion_velocities, self.dt, push)
         return replace(motion, push=push, coupling=coupling), change
 
     def _free(self, world: World, change: Floats | None) -> tuple[Floats, Floats, Floats]:
         """Velocities (rows, 6) without contacts of the bodies of `near`, with constraints, of contacts (nc, 3), and
         their rounding (nc,); collective. Sets `middle` and the inverse mass of constrained bodies."""
-        given, row, owned = self.contact_map.given, self.contact_map.body, world.owned
+        given, row, owned = self.contact_map.source, self.contact_map.body, world.owned
         free, self.middle = free_velocities(world, self.near, self.motion, change)
         if self.applied is not None or change is not None:
             self.contact_map.halo.update(free)
@@ -260,12 +261,12 @@ class ContactSystem:
     def keep(self, world: World, impulse: Floats, momentum: Floats) -> Floats:
         """What the laws of contact keep (nc, columns) for the next step, for the impulses (parts nc, 3) of the cone
         problem and their momenta; collective."""
-        if not world.pairs.columns or self.met is None:
+        if not world.pairs.columns or self.contact_state is None:
             return self.past
         count = len(self.key)
         impulse, change = impulse[:count], self.problem_map.velocities(momentum.reshape(-1, 6))[:count]
         slip = (self.r + change)[:, 1:] + self.compliance[:, 1:] * impulse[:, 1:]
-        return world.pairs.keep(self.met, self.past, Solved(impulse, self.mu, np.hypot(*slip.T)))
+        return world.pairs.keep(self.contact_state, self.past, Solved(impulse, self.mu, np.hypot(*slip.T)))
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
@@ -335,16 +336,16 @@ class ContactSystem:
         """The motion with other conditions and drives, where the impulses (parts nc, 3) of the cone problem and the
         velocities (owned, 6) show that other limits and motors hold, or that drives are too weak; else None.
         Collective."""
-        known, coupling, spent = self.motion, None, None
+        known, coupling, saturated = self.motion, None, None
         if self.coupling is not None and self.coupling.decides:
             coupling = coupling_refound(world, self.coupling, self._push(*self.parts(impulse)))
-        if self.drives.most.any():
+        if self.drives.bound.any():
             large = large_velocity(world, known, velocity)
-            spent = self.drives.refound(self.drive_impulse(large), large)
-        if coupling is None and spent is None:
+            saturated = self.drives.refound(self.drive_impulse(large), large)
+        if coupling is None and saturated is None:
             return None
         known = known if coupling is None else replace(known, coupling=coupling)
-        return known if spent is None else known.with_spent(world, spent)
+        return known if saturated is None else known.with_saturated(world, saturated)
 
     def _push(self, impulse: Floats, moment: Floats | None) -> Floats:
         """What contacts alone give the constrained bodies (n, 6), mass-scaled."""
@@ -354,7 +355,7 @@ class ContactSystem:
         """Impulses and angular impulses (large, 6) of the drives of large bodies, and of parts on them, that have the
         velocities `large` (large, 6) after the step."""
         line, slip = self.drives.line, self.free_large - large
-        return self.drives.impulse + (self.drives.grip * np.einsum("bi,bi->b", line, slip))[:, None] * line
+        return self.drives.impulse + (self.drives.servo_inertia * np.einsum("bi,bi->b", line, slip))[:, None] * line
 
 
 def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> ContactMap:
@@ -374,7 +375,7 @@ def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> 
 def gap_velocities(
     world: World, contacts: Contacts, dt: float, recovery_speed: float
 ) -> tuple[Floats, Floats, Floats]:
-    """`dem.start.stiffness.gap_velocities` of these contacts."""
+    """Return `dem.start.stiffness.gap_velocities` of these contacts."""
     table, rows = contacts.near.bodies, (contacts.a, contacts.b)
     return stiffness.gap_velocities(
         world.pairs.stiffness, table.material, table.mass, *rows, contacts.linear_gap, dt, float(recovery_speed)
@@ -382,8 +383,8 @@ def gap_velocities(
 
 
 def inverse_root_masses(world: World, drives: Drives) -> Floats:
-    """M^-1/2 of the bodies whose rows this rank owns, as `CompactRows.root` has it: (owned, 6) where that is all on all
-    ranks, else (owned, 12)."""
+    """Return M^-1/2 of the bodies whose rows this rank owns, as `CompactRows.root` has it: (owned, 6) where that is all
+    on all ranks, else (owned, 12)."""
     last = world.comm.rank == world.comm.size - 1
     tables = [world.grains, with_servos(world.large, drives)] if last else [world.grains]
     if world.only_spheres and not bodies.is_dynamic(world.large).any():
@@ -410,17 +411,18 @@ def _inverse_roots(mass: Floats, inertia: Floats) -> Floats:
 
 
 def with_servos(large: Bodies, drives: Drives) -> Bodies:
-    """The large bodies with what servos add to their masses and to their moments about hinges."""
-    if not drives.grip.any():
+    """Return the large bodies with what servos add to their masses and to their moments about hinges."""
+    if not drives.servo_inertia.any():
         return large
     mass, inertia = large.mass.copy(), large.inertia.copy()
-    mass += drives.grip * drives.line[:, :3].any(axis=1)
-    inertia[:, 2] += drives.grip * drives.line[:, 3:].any(axis=1)  # the z axis of a hinged body is that of its hinge
+    mass += drives.servo_inertia * drives.line[:, :3].any(axis=1)
+    turns = drives.line[:, 3:].any(axis=1)
+    inertia[:, 2] += drives.servo_inertia * turns  # the z axis of a hinged body is that of its hinge
     return replace(large, mass=mass, inertia=inertia)
 
 
 def contact_frames(normal: Floats) -> Floats:
-    """Orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
+    """Return orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
 
     Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
     but where the sign of its z component changes.
@@ -443,8 +445,8 @@ def _frames(normal: Floats) -> Floats:
 
 
 def contact_arms(contacts: Contacts, position: Floats, row: np.ndarray) -> Floats:
-    """Vectors (nc, 6) from the centres of the two bodies of each contact, or of the image of the second, to its point;
-    `row` (nc, 2) are the bodies' rows, uint32, in a table of positions (rows, 3) [m]."""
+    """Return vectors (nc, 6) from the centres of the two bodies of each contact, or of the image of the second, to its
+    point; `row` (nc, 2) are the bodies' rows, uint32, in a table of positions (rows, 3) [m]."""
     moved = np.zeros((0, 3)) if contacts.moved is None else contacts.moved
     return _arms(contacts.point, moved, position, row)
 

@@ -21,7 +21,7 @@ from dem.model.world import World
 from dem.motion import Pose
 from dem.together import together
 from dem.unconstrained.applied import Applied, applied_impulses
-from dem.unconstrained.drives import Drives, drives_of, given_velocities
+from dem.unconstrained.drives import Drives, drives_of, velocities_of_motions
 
 if TYPE_CHECKING:
     from dem.unconstrained.constraints import Coupling
@@ -33,8 +33,8 @@ class UnconstrainedMotion:
 
     dt: float  #: [s]
     poses: dict[int, Pose]  #: of large bodies of prescribed motion at the end of the step, by row
-    #: (large, 6) mean velocities that motions give, see `dem.unconstrained.drives.given_velocities` [m/s, rad/s]
-    given: Floats
+    #: (large, 6) mean velocities that motions give, see `dem.unconstrained.drives.velocities_of_motions` [m/s, rad/s]
+    motion_velocities: Floats
     prescribed: Floats  #: (large, 6) of prescribed motions the same; other bodies keep theirs
     applied: Applied | None  #: what parts give; None without any
     drives: Drives  #: of the large bodies, the same on all ranks
@@ -44,28 +44,28 @@ class UnconstrainedMotion:
     push: Floats | None = None
     coupling: Coupling | None = None  #: by constraints, with that push, and what contacts have shown; likewise None
 
-    def with_spent(self, world: World, spent: Ints) -> UnconstrainedMotion:
-        """The same with drives that give all their strength, see `Drives.spent`; collective."""
-        return replace(self, drives=_drives(world, self.dt, self.given, self.applied, spent))
+    def with_saturated(self, world: World, saturated: Ints) -> UnconstrainedMotion:
+        """The same with drives that give all their strength, see `Drives.saturated`; collective."""
+        return replace(self, drives=_drives(world, self.dt, self.motion_velocities, self.applied, saturated))
 
 
 def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
-    """The motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a part
+    """Return the motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a part
     fails."""
     positive("time step", dt)
     poses = world.poses(world.time + dt)
-    given, moves = given_velocities(world, poses, dt), bodies.is_dynamic(world.large)
-    prescribed = np.where(moves[:, None], world.large.velocity, given)
-    applied, grains = applied_impulses(world, dt, given), free_velocity(world.grains, world.gravity, dt)
+    motion_velocities, moves = velocities_of_motions(world, poses, dt), bodies.is_dynamic(world.large)
+    prescribed = np.where(moves[:, None], world.large.velocity, motion_velocities)
+    applied, grains = applied_impulses(world, dt, motion_velocities), free_velocity(world.grains, world.gravity, dt)
     if applied is not None:
         grains += velocity_changes(world.grains, applied.grains)
-    drives = _drives(world, dt, given, applied, np.zeros(len(world.large), int))
-    return UnconstrainedMotion(dt, poses, given, prescribed, applied, drives, grains)
+    drives = _drives(world, dt, motion_velocities, applied, np.zeros(len(world.large), int))
+    return UnconstrainedMotion(dt, poses, motion_velocities, prescribed, applied, drives, grains)
 
 
-def _drives(world: World, dt: float, given: Floats, applied: Applied | None, spent: Ints) -> Drives:
+def _drives(world: World, dt: float, motion_velocities: Floats, applied: Applied | None, saturated: Ints) -> Drives:
     pushed = None if applied is None else applied.large
-    call = partial(drives_of, world, dt, given, pushed, spent)
+    call = partial(drives_of, world, dt, motion_velocities, pushed, saturated)
     return together(world.comm, "motion of a large body", call) if bodies.is_dynamic(world.large).any() else call()
 
 
@@ -98,14 +98,14 @@ def free_velocities(
     if change is None:
         return velocity, None
     owned = len(change)
-    given, middle = np.zeros((owned, 3)), np.full((owned, 3), np.nan)
+    spin_change, middle = np.zeros((owned, 3)), np.full((owned, 3), np.nan)
     if pushed is not None:
-        given[: near.grains] = pushed[:, 3:]
+        spin_change[: near.grains] = pushed[:, 3:]
     if owned > near.grains:  # of the last rank, which has no ghosts
-        given[near.grains :] = velocity_changes(world.large, free.drives.impulse)[:, 3:]
+        spin_change[near.grains :] = velocity_changes(world.large, free.drives.impulse)[:, 3:]
     own = near.bodies.take(slice(owned))
     rows = gyroscopic(own)
     now = own.quaternion[rows], own.velocity[rows, 3:], own.inertia[rows]
-    spin, middle[rows] = free_spin(*now, free.dt, (given + change[:, 3:])[rows])
-    velocity[rows, 3:] = spin + given[rows]
+    spin, middle[rows] = free_spin(*now, free.dt, (spin_change + change[:, 3:])[rows])
+    velocity[rows, 3:] = spin + spin_change[rows]
     return velocity, middle

@@ -21,18 +21,18 @@ from dem.unconstrained.drives import as_motions_allow, free_directions
 
 @dataclass(frozen=True)
 class Applied:
-    """Impulses and angular impulses of parts over a step of dt [s], in which motions give large bodies the velocities
-    `given` [N s, N m s]."""
+    """Impulses and angular impulses of parts over a step of dt [s], in which motions give large bodies the
+    `motion_velocities` [N s, N m s]."""
 
     dt: float
-    given: Floats  #: (large, 6) [m/s, rad/s]
+    motion_velocities: Floats  #: (large, 6) [m/s, rad/s]
     grains: Floats  #: (grains, 6) of this rank
     large: Floats  #: (large, 6), the same on all ranks; zero on bodies of prescribed motion
     memory: dict[str, Floats] = field(default_factory=dict)  #: by kind, see `dem.parts.named.Force.act`
 
     def ends(self, world: World, members: Mapping[str, Tie]) -> Ends:
         """The bodies at the ends of parts, with the impulses so far; collective."""
-        return ends_of(world, members.values(), self.grains, self.large, self.given, self.dt)
+        return ends_of(world, members.values(), self.grains, self.large, self.motion_velocities, self.dt)
 
     def add(self, world: World, ends: Ends, impulse: Floats) -> None:
         """Add impulses (n, 6) on these bodies; no force moves large bodies of prescribed motion."""
@@ -42,13 +42,14 @@ class Applied:
         self.large[:] += np.where(bodies.is_dynamic(world.large)[:, None], impulse[first:-1], 0.0)
 
 
-def applied_impulses(world: World, dt: float, given: Floats) -> Applied | None:
-    """What parts give in the next step of dt [s] in which motions give the velocities `given` (large, 6); None without
-    any; collective. SceneError if a part fails."""
+def applied_impulses(world: World, dt: float, motion_velocities: Floats) -> Applied | None:
+    """What parts give in the next step of dt [s], in which large bodies have the `motion_velocities` (large, 6) that
+    motions give; None without any; collective. SceneError if a part fails."""
     kinds = kinds_of(Force, world.named)
     if not kinds:
         return None
-    applied = Applied(dt, given, np.zeros(world.grains.velocity.shape), np.zeros(world.large.velocity.shape))
+    grains, large = np.zeros(world.grains.velocity.shape), np.zeros(world.large.velocity.shape)
+    applied = Applied(dt, motion_velocities, grains, large)
     for kind, acting, members in kinds:
         memory = acting.act(members, world, applied)
         if memory is not None:
@@ -74,7 +75,7 @@ COLUMNS = (0, 3, 7, 13, 19, 20, 29, 32, 35)  #: where what ranks tell of the gra
 
 
 def ends_of(
-    world: World, parts: Iterable[Tie], grains: Floats, large: Floats, given: Floats, dt: float
+    world: World, parts: Iterable[Tie], grains: Floats, large: Floats, motion_velocities: Floats, dt: float
 ) -> Ends:
     """The bodies at the ends of parts, with impulses (grains, 6) and (large, 6); collective."""
     ids, row = rows_of(world, parts)
@@ -103,7 +104,7 @@ def ends_of(
         np.concatenate([position, tools.position, np.zeros((1, 3))]),
         np.concatenate([turn, tools.quaternion, [[1.0, 0.0, 0.0, 0.0]]]),
         np.concatenate([velocity, tools.velocity, np.zeros((1, 6))]),
-        np.concatenate([free, as_motions_allow(world, pushed, given), np.zeros((1, 6))]),
+        np.concatenate([free, as_motions_allow(world, pushed, motion_velocities), np.zeros((1, 6))]),
         inverse,
         np.concatenate([moments, tools.inertia, np.full((1, 3), np.inf)]),
         np.concatenate([pushes, change[:, 3:], np.zeros((1, 3))]),

@@ -47,7 +47,7 @@ class Coupling:
     scaled: Floats  #: (k, 6 n) B = J M^-1/2
     root: Floats  #: (n, 6, 6) M^-1/2
     part: Ints  #: (k,) of which constraint each row is
-    way: Ints  #: (k,) which of its six coordinates
+    coordinate: Ints  #: (k,) which of its six coordinates
     kind: Ints  #: (k,) HELD, MOTOR, LOWER or UPPER
     target: Floats  #: (k,) t
     bound: Floats  #: (k,) greatest impulses, inf: none
@@ -55,7 +55,7 @@ class Coupling:
     slip: Floats  #: (k,) what bounded motors lose to the load that they can just bear
     axes: Floats  #: (constraints, 3, 3) rows x, y, z in the world
     on: Bools  #: (k,) the rows that hold
-    given: Floats  #: (k,) impulses of the others: of motors that are too weak
+    saturated: Floats  #: (k,) impulses of the others: of motors that are too weak
     solver: Floats  #: (k, k) (B B' + e)^-1 of the rows that hold
     impulse: Floats  #: (k,) without contacts [N s, N m s]
     change: Floats  #: (n, 6) of velocities, by these impulses
@@ -99,10 +99,10 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     found = geometry(ends.position, ends.quaternion)
     count, every = len(ends.free), [part for _, members in parts for part in members]
     asked = [(n, *each) for n, part in enumerate(every) for each in part.conditions(found.error[n], dt)]
-    which, ways, kind, t, bound = (np.array(column) for column in zip(*asked))
+    which, coordinates, kind, t, bound = (np.array(column) for column in zip(*asked))
     J, along = np.zeros((len(t), count, 6)), found.rows
     for side in (0, 1):
-        np.add.at(J, (np.arange(len(t)), row[which, side]), along[which, ways, side])
+        np.add.at(J, (np.arange(len(t)), row[which, side]), along[which, coordinates, side])
     root = _roots(ends.inverse_mass)
     B = np.einsum("knx,nxy->kny", J, root).reshape(len(t), -1)
     now, velocity = J.reshape(len(t), -1) @ ends.velocity.ravel(), ends.free.copy()
@@ -110,7 +110,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     slip = np.maximum(DROOP * np.abs(t), np.abs(t - now))
     motors = np.isfinite(bound)
     slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
-    on, given = kind <= MOTOR, np.zeros(len(t))
+    on, saturated = kind <= MOTOR, np.zeros(len(t))
     rows = unequal(ends.moments).nonzero()[0]
     known = ends.quaternion[rows], ends.velocity[rows, 3:], ends.moments[rows]
     spin, middle = np.full((2, count, 3), np.nan)
@@ -118,18 +118,18 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     expected, pushed = push.ravel(), B @ push.ravel()
     for _ in range(ROUNDS):
         change = np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
-        alone, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.given[rows])
-        spin[rows] = velocity[rows, 3:] = alone + ends.given[rows]
+        spun, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.spin_change[rows])
+        spin[rows] = velocity[rows, 3:] = spun + ends.spin_change[rows]
         free = J.reshape(len(t), -1) @ velocity.ravel()
         for _ in range(2 * len(t) + 1):
-            g = _impulses(A, t, free, on, given)
+            g = _impulses(A, t, free, on, saturated)
             wrong = _wrong(kind, t, bound, on, g, free + A @ g, 0.0)
             if not wrong.any():
                 break
-            on, given = _turned(kind, bound, on, given, g, wrong)
+            on, saturated = _turned(kind, bound, on, saturated, g, wrong)
         last, expected = expected, B.T @ g
         if pushed.any():
-            expected = push.ravel() + B.T @ _impulses(A, t, free + pushed, on, given)
+            expected = push.ravel() + B.T @ _impulses(A, t, free + pushed, on, saturated)
         if np.abs(expected - last).max() <= 1e-7 * np.abs(expected).max():
             break
         after = velocity + np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
@@ -137,10 +137,11 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
             break
         place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after[:, 3:], dt)
         error = geometry(place, turn).error
-        bent = (error - found.error)[which, ways] / dt - J.reshape(len(t), -1) @ after.ravel()
+        bent = (error - found.error)[which, coordinates] / dt - J.reshape(len(t), -1) @ after.ravel()
         t = np.where(held, left - bent, left)
-    fixed = (J, B, root, which, ways, kind, t, bound, free, slip, found.axes)
-    return Coupling(*fixed, on, given, *_solved(B, root, t, bound, free, slip, on, given), spin=spin, middle=middle)
+    fixed = (J, B, root, which, coordinates, kind, t, bound, free, slip, found.axes)
+    solved = _solved(B, root, t, bound, free, slip, on, saturated)
+    return Coupling(*fixed, on, saturated, *solved, spin=spin, middle=middle)
 
 
 def refound(known: Coupling, push: Floats) -> Coupling | None:
@@ -152,18 +153,18 @@ def refound(known: Coupling, push: Floats) -> Coupling | None:
     wrong = _wrong(known.kind, known.target, known.bound, known.on, g, after, DROOP)
     if not wrong.any():
         return None
-    on, given = _turned(known.kind, known.bound, known.on, known.given, g, wrong)
+    on, saturated = _turned(known.kind, known.bound, known.on, known.saturated, g, wrong)
     numbers = known.target, known.bound, known.free, known.slip
-    solver, impulse, change, matrix = _solved(known.scaled, known.root, *numbers, on, given)
+    solver, impulse, change, matrix = _solved(known.scaled, known.root, *numbers, on, saturated)
     return dataclasses.replace(
-        known, on=on, given=given, solver=solver, impulse=impulse, change=change, matrix=matrix
+        known, on=on, saturated=saturated, solver=solver, impulse=impulse, change=change, matrix=matrix
     )
 
 
-def _impulses(A: Floats, t: Floats, free: Floats, on: Bools, given: Floats) -> Floats:
-    """Impulses (k,) that bring the rows that hold to t; of the others the given ones."""
-    g = given.copy()
-    g[on] = np.linalg.lstsq(A[on][:, on], (t - free - A @ given)[on], rcond=1e-12)[0]
+def _impulses(A: Floats, t: Floats, free: Floats, on: Bools, saturated: Floats) -> Floats:
+    """Impulses (k,) that bring the rows that hold to t; of the others those that saturate them."""
+    g = saturated.copy()
+    g[on] = np.linalg.lstsq(A[on][:, on], (t - free - A @ saturated)[on], rcond=1e-12)[0]
     return g
 
 
@@ -179,21 +180,21 @@ def _wrong(kind: Ints, t: Floats, bound: Floats, on: Bools, g: Floats, after: Fl
     return wrong
 
 
-def _turned(kind: Ints, bound: Floats, on: Bools, given: Floats, g: Floats, wrong: Bools) -> tuple[Bools, Floats]:
-    """The rows that hold and the given impulses of the others, after the wrong ones have changed sides."""
-    given = given.copy()
-    given[wrong] = 0.0
+def _turned(kind: Ints, bound: Floats, on: Bools, saturated: Floats, g: Floats, wrong: Bools) -> tuple[Bools, Floats]:
+    """The rows that hold and the saturated impulses of the others, after the wrong ones have changed sides."""
+    saturated = saturated.copy()
+    saturated[wrong] = 0.0
     weak = wrong & on & (kind == MOTOR)
-    given[weak] = np.sign(g[weak]) * bound[weak]
-    return on ^ wrong, given
+    saturated[weak] = np.sign(g[weak]) * bound[weak]
+    return on ^ wrong, saturated
 
 
 def _solved(
-    B: Floats, root: Floats, t: Floats, bound: Floats, free: Floats, slip: Floats, on: Bools, given: Floats
+    B: Floats, root: Floats, t: Floats, bound: Floats, free: Floats, slip: Floats, on: Bools, saturated: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """`solver`, `impulse`, `change` and `matrix` of a `Coupling`."""
     A = B @ B.T
-    g = _impulses(A, t, free, on, given)
+    g = _impulses(A, t, free, on, saturated)
     room = bound - np.abs(g)  # not positive where only contacts bring a motor to its speed: it is held there
     yields = np.isfinite(bound) & (room > 0.0)
     e = np.divide(slip, room, out=np.zeros(slip.shape), where=yields)
@@ -222,18 +223,18 @@ def _parts(world: World) -> Kinds:
 
 
 def coupling_of(
-    world: World, applied: Applied | None, given: Floats, dt: float, push: Floats | None
+    world: World, applied: Applied | None, motion_velocities: Floats, dt: float, push: Floats | None
 ) -> Coupling | None:
-    """The constraints in the next step of dt [s] with what is applied, in which motions give the velocities `given`
-    (large, 6); None without any. `push` (owned, 6): the mass-scaled momenta that contacts are expected to give the
-    bodies whose rows this rank owns. Collective."""
+    """The constraints in the next step of dt [s] with what is applied, in which large bodies have the
+    `motion_velocities` (large, 6) that motions give; None without any. `push` (owned, 6): the mass-scaled momenta that
+    contacts are expected to give the bodies whose rows this rank owns. Collective."""
     parts = _parts(world)
     if not parts:
         return None
     grains, large = np.zeros(world.grains.velocity.shape), np.zeros(world.large.velocity.shape)
     if applied is not None:
         grains, large = applied.grains, applied.large
-    ends = ends_of(world, [part for _, members in parts for part in members], grains, large, given, dt)
+    ends = ends_of(world, [part for _, members in parts for part in members], grains, large, motion_velocities, dt)
     gathered = np.zeros(ends.free.shape)
     if push is not None:
         id = np.concatenate([world.grains.id, world.large.id])[: len(push)]

@@ -39,5 +39,6 @@ class Vibrated(Experiment):
 
     def record(self, step):
         """Mean heights of both sizes, and their difference over their sum."""
-        large, small = (measures.mean_position(step.sample, step.sample.of(name))[2] for name in ("large", "small"))
+        sample = step.sample
+        large, small = (measures.mean_position(sample, sample.of_material(name))[2] for name in ("large", "small"))
         return {"large_z [m]": large, "small_z [m]": small, "segregation": (large - small) / (large + small)}

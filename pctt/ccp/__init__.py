@@ -119,8 +119,8 @@ def solve(
 
 
 def with_part(problem: ConeProblem, result: Result, rows: NDArray[np.intp], part: Result) -> Result:
-    """The result with the impulses of these rows from a result of their own (`ConeProblem.part`), and with its cost.
-    Collective."""
+    """Return the result with the impulses of these rows from a result of their own (`ConeProblem.part`), and with its
+    cost. Collective."""
     impulse = result.impulse.copy()
     impulse[rows] = part.impulse
     result = dataclasses.replace(result, impulse=impulse).after(part)
@@ -226,8 +226,8 @@ def _start(problem: ConeProblem, guess: Array | None) -> Array:
 
 
 def newton_for(comm: MPI.Comm, type: str, form: str = "auto", compare: Comparison | None = None) -> Newton:
-    """The Newton systems that a method of SOLVERS works with; ``form`` is auto or of FORMS. ValueError for one that the
-    method cannot have."""
+    """Return the Newton systems that a method of SOLVERS works with; ``form`` is auto or of FORMS. ValueError for one
+    that the method cannot have."""
     _refuse_form(type, form)
     if compare is not None and not compare.names:
         compare = None

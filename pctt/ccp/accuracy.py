@@ -54,7 +54,7 @@ class Accuracy:
 
 
 def measure(problem: ConeProblem, impulse: Array) -> Accuracy:
-    """The figures of an impulse (nc, 3), or (nc, 2) in the plane; the same on every rank."""
+    """Return the figures of an impulse (nc, 3), or (nc, 2) in the plane; the same on every rank."""
     g = problem.in_cones(impulse)
     return figures(problem, g, problem.velocity_of(problem.momentum(g)))
 

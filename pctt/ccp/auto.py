@@ -47,7 +47,7 @@ class Auto:
     """Settings of `auto`."""
 
     patience: float = number(25.0, "APGD's iterations per digit of the tolerance and cube root of the contacts")
-    few: float = number(6.0, "APGD's iterations per digit of few contacts (`newton.elimination`): 1/2 `conic`")
+    elimination: float = number(6.0, "APGD's iterations per digit of few contacts (`newton.elimination`): 1/2 `conic`")
     law: float = number(5.0, "factor on it for Coulomb's law: more systems, and unsymmetric; docs/notebook_ccp.md")
     start: float = number(3e4, "complementarity of the conic method's start, at most, by APGD's residual")
     basin: float = number(3e-4, "Coulomb residual at which the conic method's path is near enough for APGD")
@@ -56,7 +56,7 @@ class Auto:
 
     def iterations(self, problem: ConeProblem, tol: float, coulomb: bool, few: bool = False) -> int:
         """Those of APGD. Small problems have fixed costs; where they are ``few`` those of both methods are calls."""
-        per_digit = self.few if few else self.patience * np.cbrt(max(problem.size, 400))
+        per_digit = self.elimination if few else self.patience * np.cbrt(max(problem.size, 400))
         per_digit *= self.law if coulomb else 1.0
         return broadcast(problem.comm, int(-np.log10(tol) * per_digit))
 

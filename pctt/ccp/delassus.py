@@ -163,7 +163,7 @@ class BlockMap(ContactMap):
         precision: type[np.floating] = np.float64,
     ):  # fmt: skip
         rows = checked(comm, rows) if halo is None else rows
-        self.comm, self.given, self.precision = comm, rows, precision  # type: ignore[assignment]
+        self.comm, self.source, self.precision = comm, rows, precision  # type: ignore[assignment]
         self.body_rows = self.block_rows = rows
         self.rows, self.columns = rows.rows, rows.columns
         self._found = halo or find_halo(comm, rows.columns, rows.indices)

@@ -83,8 +83,8 @@ class Solution:
 
 
 def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
-    """The cone problem of an FCLIB file, its contacts in equal parts over the ranks; collective. One with rolling has
-    `RollingCones`, and its M must have 6 x 6 blocks.
+    """Return the cone problem of an FCLIB file, its contacts in equal parts over the ranks; collective. One with
+    rolling has `RollingCones`, and its M must have 6 x 6 blocks.
 
     A local problem is given by N = W. A global one is given by the map G = H' L^-T of the bodies, with M = L L', where
     M has 6 x 6 blocks on its diagonal and nothing else, and otherwise by N = H' M^-1 H. Raises FileFormatError on every
@@ -94,7 +94,7 @@ def read(path: str | Path, comm: MPI.Comm) -> ConeProblem:
 
 
 def load(path: str | Path, comm: MPI.Comm) -> Stored:
-    """The cone problem as ``read`` gives it, with the solution and the first guess of the file if it has
+    """Return the cone problem as ``read`` gives it, with the solution and the first guess of the file if it has
     impulses there: all published files have the groups, many with nothing but zeros in them."""
     parts: list[dict[str, Any]] = []
     error = None

@@ -43,17 +43,17 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
     parts = _parts(
         g, problem.r, problem.cones.first_tangents, problem.compliance, problem.diagonal, max(largest, 1e-300)
     )
-    along, closing, yielding, length, alone = problem.sum(np.array(parts)).tolist()
+    along, closing, yielding, length, by_diagonal = problem.sum(np.array(parts)).tolist()
     size, speed = math.sqrt(length), math.sqrt(closing)
     bound = (along / (1e3 * size * speed)) ** 2 if along < 0 < size * speed else 0.0
-    if not bound > max(yielding / alone if alone > 0 else 0.0, 1e-15):  # a part of d'Nd, and its rounding
+    if not bound > max(yielding / by_diagonal if by_diagonal > 0 else 0.0, 1e-15):  # a part of d'Nd, and its rounding
         return ""
-    energy = problem.dot(problem.product(g) if y is None else y - problem.r, g) if alone > 0 else 0.0
-    if alone > 0 and not bound > energy / alone:
+    energy = problem.dot(problem.product(g) if y is None else y - problem.r, g) if by_diagonal > 0 else 0.0
+    if by_diagonal > 0 and not bound > energy / by_diagonal:
         return ""
     if problem.contact_map is not None and not bound > _left_over(problem, g / size):
         return ""
-    if energy < -1e-12 * alone:
+    if energy < -1e-12 * by_diagonal:
         return f"unbounded: N is indefinite, d'Nd = {energy / length:.1e} for a direction d of impulses"
     return f"unbounded: impulses grow without limit (norm {size:.1e} N s, {-along / size:.1e} J for each N s more)"
 
@@ -115,7 +115,7 @@ def _largest(g):
 def _parts(g, r, mu, compliance, diagonal, largest):
     """The sums of `why_unbounded` over the rows of this rank: r'g; ||r||^2 of what impulses answer, by the shares of
     the rows in g; g'Cg; g'g; and g'g by the means of the diagonal."""
-    along, closing, yielding, length, alone = 0.0, 0.0, 0.0, 0.0, 0.0
+    along, closing, yielding, length, by_diagonal = 0.0, 0.0, 0.0, 0.0, 0.0
     for c in range(len(g)):
         square = g[c, 0] * g[c, 0] + g[c, 1] * g[c, 1] + g[c, 2] * g[c, 2]
         tangential = r[c, 1] * g[c, 1] + r[c, 2] * g[c, 2], r[c, 1] * r[c, 1] + r[c, 2] * r[c, 2]
@@ -127,5 +127,5 @@ def _parts(g, r, mu, compliance, diagonal, largest):
         for k in range(3):
             yielding += compliance[c, k] * g[c, k] * g[c, k]
             mean += diagonal[c, k] / 3.0
-        alone += mean * square
-    return along, closing, yielding, length, alone
+        by_diagonal += mean * square
+    return along, closing, yielding, length, by_diagonal

@@ -105,8 +105,8 @@ def curves(records: Mapping[str, np.ndarray], analysis: Mapping[str, np.ndarray]
     analysis.csv has them. There is no figure without such columns.
     """
     made = {}
-    for way in [head for head in records if re.search(r"_(position|displacement) \[m\]$", head)]:
-        unit = "N" if "position" in way else "Pa"
+    for abscissa in [head for head in records if re.search(r"_(position|displacement) \[m\]$", head)]:
+        unit = "N" if "position" in abscissa else "Pa"
         heads = [head for head in records if head.endswith(f" [{unit}]") and not re.match("(force|torque)_", head)]
         strain = analysis.get("volume_strain") if unit == "Pa" else None
         if not heads:
@@ -115,22 +115,22 @@ def curves(records: Mapping[str, np.ndarray], analysis: Mapping[str, np.ndarray]
         axes, *below = figure.subplots(1 if strain is None else 2, 1, sharex=True, squeeze=False)[:, 0]
         shown = []
         for k, head in enumerate(heads):
-            filtered = analysis.get(head.replace(" [", "_filtered [", 1), np.full_like(records[way], np.nan))
+            filtered = analysis.get(head.replace(" [", "_filtered [", 1), np.full_like(records[abscissa], np.nan))
             name, raw = head.rpartition(" [")[0].replace("_", " "), records[head]
-            axes.plot(records[way], raw, color=f"C{k}", alpha=0.4, linewidth=0.9, label=f"{name}, raw")
+            axes.plot(records[abscissa], raw, color=f"C{k}", alpha=0.4, linewidth=0.9, label=f"{name}, raw")
             shown += [*np.nanpercentile(raw, [0.5, 99.5])]  # peaks would flatten the rest
             if np.isfinite(filtered).any():
-                axes.plot(records[way], filtered, color=f"C{k}", linewidth=1.6, label=f"{name}, filtered")
+                axes.plot(records[abscissa], filtered, color=f"C{k}", linewidth=1.6, label=f"{name}, filtered")
                 shown += [np.nanmin(filtered), np.nanmax(filtered)]
         room = 0.08 * (max(shown) - min(shown)) or 1.0
         axes.set_ylim(min(shown) - room, max(shown) + room)
         axes.set_ylabel(f"{UNITS[unit]} [{unit}]")
         axes.legend(fontsize="small")
         for panel in below:
-            panel.plot(records[way], strain)
+            panel.plot(records[abscissa], strain)
             panel.set_ylabel("volume strain")
-        figure.axes[-1].set_xlabel(way.replace("_", " "))
-        made[way.rpartition("_")[0] + ("_force" if unit == "N" else "_stress")] = figure
+        figure.axes[-1].set_xlabel(abscissa.replace("_", " "))
+        made[abscissa.rpartition("_")[0] + ("_force" if unit == "N" else "_stress")] = figure
     return made
 
 
@@ -179,9 +179,9 @@ def energy(columns: Mapping[str, np.ndarray]) -> Figure:
     since the beginning of the first step. The drift is the error of the time stepping. Potential energy counts from the
     first record."""
     time = columns["time [s]"]
-    kinetic, potential, spring, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
+    kinetic, potential, elastic, work, friction, impact, stepping = (columns[f"{name} [J]"] for name in BALANCE)
     work = work + sum(sign * columns.get(f"{name} [J]", 0.0) for name, sign in OTHERS.items())
-    total = kinetic + spring + potential - potential[0] + np.cumsum(friction + impact - work)
+    total = kinetic + elastic + potential - potential[0] + np.cumsum(friction + impact - work)
     figure = Figure(figsize=(9.5, 6.4))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     above.plot(time, kinetic, label="kinetic energy")

@@ -142,9 +142,9 @@ class Scene:
                 center = place + quaternion.rotate(turn, np.array(shape["center"]))
                 axes = quaternion.matrix(quaternion.multiply(turn, np.array(shape["quaternion"]))).T
                 edges = np.array(shape["half_extents"])[:, None] * axes
-                way = axes @ (self.box.mean(axis=0) - center)
-                k = int(np.argmax(np.abs(way) - shape["half_extents"]))
-                side = np.sign(way[k])
+                offset = axes @ (self.box.mean(axis=0) - center)
+                k = int(np.argmax(np.abs(offset) - shape["half_extents"]))
+                side = np.sign(offset[k])
                 halves = np.array([edges[k - 2], side * edges[k - 1]])
                 found.append(Wall(center + side * edges[k], side * axes[k], halves, row))
         return found

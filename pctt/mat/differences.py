@@ -92,7 +92,7 @@ def differences_in(P: PETSc.Mat) -> Differences | None:
 def from_differences(
     kernel: Callable[[Array], Array], grid: Sequence[int], block: int = 1, comm: MPI.Comm | PETSc.Comm | None = None
 ) -> PETSc.Mat:
-    """The matrix A(x, y) = kernel(x - y) for the points x, y of a grid, as a Mat that multiplies by FFT.
+    """Return the matrix A(x, y) = kernel(x - y) for the points x, y of a grid, as a Mat that multiplies by FFT.
 
     kernel : takes differences of grid indices, integers (D, p), and returns numbers (p,), or (p, block, block) if a
         point has several unknowns; all ranks call it once, for all differences

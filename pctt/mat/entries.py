@@ -58,7 +58,7 @@ class Combination:
     terms: Sequence[tuple[float, Entry]]
 
     @classmethod
-    def of(cls, function: Entry) -> Combination:
+    def of_function(cls, function: Entry) -> Combination:
         return function if isinstance(function, cls) else cls(0.0, ((1.0, function),))
 
     def __call__(self, i: Array, j: Array) -> Array:
@@ -89,7 +89,7 @@ class Entries:
         self.comm, self.function = comm, function
 
     @classmethod
-    def of(cls, P: PETSc.Mat) -> Entries:
+    def of_mat(cls, P: PETSc.Mat) -> Entries:
         """The entries of a Mat for which `has_entries` is true."""
         comm, function = P.comm.tompi4py(), given(P, "entries")
         found = comm.allgather(None if function is None else callable(function))
@@ -166,7 +166,7 @@ def is_symmetric(entries: Entries, rows: int) -> bool:
 def diagonal(P: PETSc.Mat) -> Array:
     """This rank's part of the diagonal, for a Mat with `has_entries`; collective."""
     here = np.arange(*P.getOwnershipRange())
-    return Entries.of(P).own(here, here)
+    return Entries.of_mat(P).own(here, here)
 
 
 def diagonal_blocks(P: PETSc.Mat) -> Array:
@@ -174,4 +174,4 @@ def diagonal_blocks(P: PETSc.Mat) -> Array:
     bs = P.getBlockSize()
     rows = np.arange(*P.getOwnershipRange()).reshape(-1, bs, 1)
     i, j = np.broadcast_arrays(rows, rows.transpose(0, 2, 1))
-    return Entries.of(P).own(i.ravel(), j.ravel()).reshape(i.shape)
+    return Entries.of_mat(P).own(i.ravel(), j.ravel()).reshape(i.shape)

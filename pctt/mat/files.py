@@ -54,7 +54,7 @@ def save(mat: PETSc.Mat, path: str | os.PathLike[str]) -> None:
 
 
 def load(path: str | os.PathLike[str], comm: MPI.Comm | PETSc.Comm | None = None) -> PETSc.Mat:
-    """The Mat that `save` wrote, on any number of ranks. Collective.
+    """Return the Mat that `save` wrote, on any number of ranks. Collective.
 
     Its entries are those of the train. FileError on all ranks if the file cannot be read, is damaged, or is none of
     `save`.

@@ -222,7 +222,7 @@ class GridTrain:
 
     @property
     def _combination(self) -> Combination:
-        return Combination.of(self.function or self.entries)
+        return Combination.of_function(self.function or self.entries)
 
     def entries(self, i: Array, j: Array) -> Array:
         """The entries (p,) of the train at rows i and columns j of the Mat."""

@@ -17,7 +17,7 @@ from pctt.tt.inverse import invert_positive
 
 
 def inverse(A: PETSc.Mat, eps: float = 1e-6, max_rank: int = MAX_RANK) -> PETSc.Mat:
-    """The inverse X of a symmetric positive definite A; ``X.mult(b, x)`` solves A x = b. Collective.
+    """Return the inverse X of a symmetric positive definite A; ``X.mult(b, x)`` solves A x = b. Collective.
 
     Parameters
     ----------

@@ -59,12 +59,12 @@ class Places:
         return self.around
 
 
-def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), told: Array | None = None) -> Places:
+def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), coordinates: Array | None = None) -> Places:
     """All that is known of the places of P's block rows; collective.
 
     dms : DMs that may describe the rows, beside that of P
-    told : points of this rank's block rows from elsewhere (``PCSetCoordinates``); the attribute ``coordinates`` of P
-        goes before
+    coordinates : points of this rank's block rows from elsewhere (``PCSetCoordinates``); the attribute ``coordinates``
+        of P goes before
 
     ValueError on all ranks if an attribute of P does not fit P.
     """
@@ -81,8 +81,8 @@ def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), told: Array | None = N
     check_points(points, P, "coordinates of the Mat")
     if points is not None:
         points = np.asarray(points, dtype=float)
-    elif _on_all(told is not None, comm):
-        points, whence = told, "PCSetCoordinates"
+    elif _on_all(coordinates is not None, comm):
+        points, whence = coordinates, "PCSetCoordinates"
         check_points(points, P, "PCSetCoordinates: points")
     else:
         points, whence = _other_points(fitting, P, comm)

@@ -68,7 +68,7 @@ def compressed_entries(
 
     start : an earlier result for a similar matrix
     """
-    entries = Entries.of(P)
+    entries = Entries.of_mat(P)
     matrix = EntryMatrix(entries, layout.digits, layout.rows, layout.comm.bcast)
     known = start.found if start is not None and start.layout.digits.modes == layout.digits.modes else None
     found = compress_cross(matrix, max_rank, eps, known, work=work)
@@ -277,7 +277,7 @@ def mat_of(matrix: GridTrain, options: Options) -> PETSc.Mat:
 
 
 def axpy(Y: PETSc.Mat, factor: float, X: PETSc.Mat) -> None:
-    """Y + factor X in place of Y, for a train Y; X is a train on the same grid, or any Mat that is c I.
+    """Put Y + factor X in the place of Y, for a train Y; X is a train on the same grid, or any Mat that is c I.
 
     ``Y.axpy(factor, X)`` does the same for two trains; other Mats it refuses in PETSc's words, or with a segmentation
     fault in PETSc 3.18, as for any Mat of type python. The sum of two trains is rounded to a tenth of eps of Y, with
@@ -327,7 +327,7 @@ def from_entries(
     entries: Entry, grid: Sequence[int], eps: float = 1e-8, max_rank: int = MAX_RANK,
     comm: MPI.Comm | PETSc.Comm | None = None, prefix: str = "",
 ) -> PETSc.Mat:  # fmt: skip
-    """The matrix A(i, j) = entries(i, j) for the points of a grid, as a Mat that multiplies with a tensor train.
+    """Return the matrix A(i, j) = entries(i, j) for the points of a grid, as a Mat that multiplies with a tensor train.
 
     entries : takes rows and columns, integer arrays (p,), and returns numbers (p,); all ranks call it
     grid : (n_1, n_2, ...), the shape of a vector as an array: row i is at numpy.unravel_index(i, grid)

@@ -72,7 +72,7 @@ class BlockICC(Context):
         self.options, self.prefix = Options(), ""
         self.factor: Factor | None = None
         self.places = Places()
-        self._of: Blocks | None = None
+        self._layout: Blocks | None = None
         self._pattern: tuple[np.ndarray, ...] = ()
         self._shift = 0.0  # with which the last matrix of the same pattern had a factor
         self._warned: set[str] = set()
@@ -137,32 +137,32 @@ class BlockICC(Context):
             self._warn(P.comm.tompi4py(), "the matrix is not symmetric, so a Cholesky factor may be useless")
         self.places = places_of(P, (pc.getDM(), pc.getOperators()[0].getDM()), self._points)
         size, block, (indptr, indices) = P.getLocalSize()[0], P.getBlockSize(), pattern
-        of_rows = len(indptr) == size + 1 and size > 0 and not (block == 3 and _has_blocks(P))
+        from_rows = len(indptr) == size + 1 and size > 0 and not (block == 3 and _has_blocks(P))
         graph = sp.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(len(indptr) - 1,) * 2)
         if self.places.points is not None:
             order = _sweep(self.places.points)
-            if of_rows and block > 1:
+            if from_rows and block > 1:
                 order = np.add.outer(block * order, np.arange(block)).ravel()
         elif graph.nnz:
             order = reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
         else:  # a rank without rows
             order = np.arange(graph.shape[0])
         self._source: np.ndarray | None = None
-        if of_rows:
-            self._of, self._source = Blocks.of_rows(graph, order)
+        if from_rows:
+            self._layout, self._source = Blocks.from_rows(graph, order)
         else:
-            self._of = Blocks.of(indptr, indices, order)
+            self._layout = Blocks.from_blocks(indptr, indices, order)
         self._pattern, self._shift = tuple(array.copy() for array in pattern), 0.0
 
     def _factorise(self, values: Array) -> str:
         """Make the factor of this rank's rows; why there is none, or nothing."""
-        assert self._of is not None
+        assert self._layout is not None
         blocks = values if self._source is None else np.append(values, 0.0)[self._source]
         tau, named = self.options.tau, f"-{self.prefix}{self.options_prefix}"
         automatic = self.options.shift == "auto"
         shift = max(0.5 * tau, self._shift) if automatic else float(self.options.shift)
         while True:
-            found = factorised(self._of, blocks, tau, shift)
+            found = factorised(self._layout, blocks, tau, shift)
             if isinstance(found, Factor):
                 self.factor, self._shift = found, shift
                 return ""

@@ -106,7 +106,7 @@ class EntriesTrain:
         if found is not None:
             self.cost_estimate = found.cost_estimate if found.inverse.kind else None
             return (1 + found.cost_estimate.each) * product * found.cost_estimate.iterations
-        if not multiplies(A) or not is_symmetric(Entries.of(P), P.getSize()[0]):
+        if not multiplies(A) or not is_symmetric(Entries.of_mat(P), P.getSize()[0]):
             return self._iterations * product
         chosen = choose(P, A, product)
         self.transform = chosen.inverse or (None if chosen.scaled else Identity())

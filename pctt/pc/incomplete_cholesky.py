@@ -48,7 +48,7 @@ class Blocks(NamedTuple):
     size: int
 
     @classmethod
-    def of(cls, indptr: np.ndarray, indices: np.ndarray, order: np.ndarray) -> Blocks:
+    def from_blocks(cls, indptr: np.ndarray, indices: np.ndarray, order: np.ndarray) -> Blocks:
         """For a pattern of blocks of 3 x 3, and their order."""
         number = np.empty(len(order), np.int64)
         number[order] = np.arange(len(order))
@@ -56,7 +56,7 @@ class Blocks(NamedTuple):
         return cls(indptr, indices, order, number, rows, 3 * len(order))
 
     @classmethod
-    def of_rows(cls, pattern: sp.csr_matrix, order: np.ndarray) -> tuple[Blocks, np.ndarray]:
+    def from_rows(cls, pattern: sp.csr_matrix, order: np.ndarray) -> tuple[Blocks, np.ndarray]:
         """For a pattern of single entries, and the order of its rows; and the place in the pattern's data, one after
         the last for zero, of each number in the blocks (nb, 3, 3), which are transposed."""
         size, count = len(order), -(-len(order) // 3)
@@ -129,7 +129,7 @@ def factorised(of: Blocks, blocks: Array, tau: float, shift: float) -> Factor | 
 def compile_loops() -> None:
     """Compile the loops, or load them, for the arrays that PETSc gives: seconds that belong to no matrix."""
     index = np.arange(2, dtype=PETSc.IntType)
-    made = factorised(Blocks.of(index, index[:1], np.zeros(1, np.int64)), np.eye(3)[None], 0.0, 0.0)
+    made = factorised(Blocks.from_blocks(index, index[:1], np.zeros(1, np.int64)), np.eye(3)[None], 0.0, 0.0)
     b = np.ones(3)
     b.flags.writeable = False  # as PETSc's arrays to read are, which is another type to the compiler
     if isinstance(made, Factor):

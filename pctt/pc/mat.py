@@ -99,10 +99,10 @@ def conjugate_gradients(
 def null_vectors(A: PETSc.Mat, P: PETSc.Mat) -> list[Array]:
     """This rank's parts of vectors that P takes to zero, of the null space of P or A and the constant. Collective."""
     spaces = [one.getNullSpace() for one in (P, A)]
-    told: list[PETSc.Vec] = next((space.getVecs() for space in spaces if space.handle), [])
+    basis: list[PETSc.Vec] = next((space.getVecs() for space in spaces if space.handle), [])
     x, y = P.createVecs()
     found = []
-    for vec in (None, *told):
+    for vec in (None, *basis):
         x.set(1.0) if vec is None else vec.copy(x)
         P.mult(x, y)
         size = P.norm(PETSc.NormType.FROBENIUS) * x.norm()

@@ -44,7 +44,7 @@ class PartialCholesky:
     """
 
     def __init__(self, P: PETSc.Mat) -> None:
-        self.comm, self.entries = P.comm.tompi4py(), Entries.of(P)
+        self.comm, self.entries = P.comm.tompi4py(), Entries.of_mat(P)
         self.first, self.last = P.getOwnershipRange()
         self.rows = P.getSize()[0]
         self.left = diagonal(P)
@@ -105,9 +105,9 @@ class PartialCholesky:
         own = np.flatnonzero((self.pivots >= self.first) & (self.pivots < self.last))
         corner = self._gathered(self.F, self.pivots, own)
         inverse = linalg.solve_triangular(corner, np.eye(len(corner)), lower=True)
-        alone = 1.0 / np.maximum((inverse**2).sum(axis=0), 1e-300)
+        leave_one_out = 1.0 / np.maximum((inverse**2).sum(axis=0), 1e-300)
         by_point = self.left.copy()
-        by_point[self.pivots[own] - self.first] = alone[own]
+        by_point[self.pivots[own] - self.first] = leave_one_out[own]
         total = self.comm.allreduce(float(self.left.sum()))
         largest = self.comm.allreduce(float(by_point.max(initial=0.0)), op=MPI.MAX)
         floor = 1e-12 * max(largest, 1e-300)
@@ -197,7 +197,7 @@ class Chosen:
     scaled : without one, whether there is block Jacobi
     each : the cost of an application, that of a product with the matrix is 1
     iterations : of conjugate gradients to 1e-8, an estimate
-    alone : of those without a preconditioner
+    unpreconditioned : of those without a preconditioner
     spent : what all trials have cost, in products
     """
 
@@ -205,7 +205,7 @@ class Chosen:
     scaled: bool
     each: float
     iterations: float
-    alone: float
+    unpreconditioned: float
     spent: float = 0.0
 
     @property
@@ -219,9 +219,9 @@ class Chosen:
 
         Half of the estimate for none was at most what they took, in all kernels tried with a random right side.
         """
-        if (self.inverse is None and not self.scaled) or self.iterations == self.alone:
+        if (self.inverse is None and not self.scaled) or self.iterations == self.unpreconditioned:
             return None
-        least = int(min(0.5 * self.alone, MANY))
+        least = int(min(0.5 * self.unpreconditioned, MANY))
         return CostEstimate(self.each, [1.0, 10 ** (-DIGITS / self.iterations)], [1.0] * (least + 1), self.spent)
 
 
@@ -296,9 +296,9 @@ def choose(P: PETSc.Mat, A: PETSc.Mat, product: float) -> Chosen:
     """
     jacobi = block_jacobi(P)
     shown = trial(A, [None] if jacobi is None else [None, jacobi])
-    alone, scaled, spent = shown.iterations[0], shown.iterations[-1], shown.spent
-    gains = jacobi is None or GAIN * scaled <= alone
-    best = Chosen(None, gains, 0.0, scaled if gains and jacobi is not None else alone, alone)
+    unpreconditioned, scaled, spent = shown.iterations[0], shown.iterations[-1], shown.spent
+    gains = jacobi is None or GAIN * scaled <= unpreconditioned
+    best = Chosen(None, gains, 0.0, scaled if gains and jacobi is not None else unpreconditioned, unpreconditioned)
     rows = P.getSize()[0]
     most = int(min(LARGEST, rows // 4, NUMBERS // rows))
     budget = OPENING * best.cost * product / (ENTRY * rows)
@@ -315,7 +315,7 @@ def choose(P: PETSc.Mat, A: PETSc.Mat, product: float) -> Chosen:
         shown = trial(A, inverses, each)
         spent += shown.spent
         for inverse, found in zip(inverses, shown.iterations):
-            new = Chosen(inverse, False, each, found, alone)
+            new = Chosen(inverse, False, each, found, unpreconditioned)
             best = new if new.cost < best.cost else best
         known, rank = rank, min(2 * rank, most)
     return replace(best, spent=spent)

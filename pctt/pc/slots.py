@@ -64,7 +64,7 @@ class Slots:
         self.place[rows] = np.arange(count) * self.capacity // max(count, 1)
         if self.evolving:
             assert points is not None
-            self._frame = Frame.of(points)
+            self._frame = Frame.bounding(points)
             codes = morton_codes(points, self._frame)[rows]
             boxes = np.arange(self.capacity // box) * box
             first = np.searchsorted(self.place[rows], boxes)  # the first row at or after the start of each box

@@ -34,7 +34,7 @@ class DifferencesInverse:
 
         Collective; ValueError on all ranks.
         """
-        entries, shape, comm, block = Entries.of(P), layout.digits.shape, layout.comm, P.getBlockSize()
+        entries, shape, comm, block = Entries.of_mat(P), layout.digits.shape, layout.comm, P.getBlockSize()
         a = differences_in(P) if layout.rows is None else None
         if a is not None and not a.symmetric:
             return None

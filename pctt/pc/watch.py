@@ -43,9 +43,10 @@ class Watch:
         norm = b.norm()
         self._enough = max(ksp.rtol * norm, ksp.atol)
         self._digits = log10(norm / self._enough) if 0 < self._enough < norm else 16.0 if norm else 0.0
-        cost, alone = cost_estimate.cost(self._digits), at_least(cost_estimate.alone, self._digits)
+        cost = cost_estimate.cost(self._digits)
+        unpreconditioned_cost = at_least(cost_estimate.unpreconditioned, self._digits)
         self._trials, self._norms = spent, [0.0]
-        self._expected = max(AT_LEAST, min(spent + GROWTH * cost, alone + AT_LEAST))
+        self._expected = max(AT_LEAST, min(spent + GROWTH * cost, unpreconditioned_cost + AT_LEAST))
         self._alone: ConjugateGradients | None = None
 
     @staticmethod

@@ -151,7 +151,7 @@ def masses_and_map(system: ContactSystem) -> tuple[np.ndarray, Array, ContactMap
     M^-1/2 of the step says it all: a body does not move where that is zero. There its mass is arbitrary.
     """
     step = system.contact_map
-    value, vector = np.linalg.eigh(root_blocks(step.given.root))
+    value, vector = np.linalg.eigh(root_blocks(step.source.root))
     largest = value.max(axis=-1, keepdims=True, initial=0.0)
     moves = value > 1e-9 * np.maximum(largest, np.finfo(float).tiny)
     turned = vector.swapaxes(-1, -2)
@@ -165,5 +165,5 @@ def masses_and_map(system: ContactSystem) -> tuple[np.ndarray, Array, ContactMap
     number = np.full(step.halo.rows, -1)
     number[: len(dynamic)][dynamic] = offsets(step.comm, count)[step.comm.rank] + np.arange(count)
     step.halo.update(number)
-    rows = replace(step.given, body=number[step.body], root=free[dynamic], columns=count)
+    rows = replace(step.source, body=number[step.body], root=free[dynamic], columns=count)
     return dynamic, masses[dynamic], ContactMap(step.comm, rows)

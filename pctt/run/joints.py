@@ -95,7 +95,7 @@ class JointNow:
         step = self._sim._last
         found, out = step.system.coupling, np.zeros(6)
         rows = np.flatnonzero(found.part == self._number)
-        np.add.at(out, found.way[rows], step.constraint_impulses[rows])
+        np.add.at(out, found.coordinate[rows], step.constraint_impulses[rows])
         return out
 
     def _mean(self, part: slice) -> Floats:

@@ -66,7 +66,7 @@ def read_options(database: Mapping[str, str], comm: MPI.Comm) -> Options:
         _refuse_for_petsc(database, form, compare)
     _refuse_places(run, comm)
     together(comm, "option -threads", lambda: _start_threads(run.threads), own=(OptionError,))
-    return Options(run, scene, asked.of(scene, relaxed=bool(run.problem or run.compare)), demo, database)
+    return Options(run, scene, asked.completed_for(scene, relaxed=bool(run.problem or run.compare)), demo, database)
 
 
 def _start_threads(count: int) -> None:
@@ -164,10 +164,10 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, compare: ccp.Compa
             for defaults in (DEFAULTS[form], DEFAULTS[form] | later):
                 ksps.append(PETSc.KSP().create(comm))
                 ksps[-1].setOptionsPrefix(OWN)
-                options, sources = to_enter(OWN, defaults, comm.size)
+                options, origins = to_enter(OWN, defaults, comm.size)
                 with entered(options), own_errors():
                     ksps[-1].setFromOptions()
-            moved = set(sources.values())
+            moved = set(origins.values())
             refuse_misspelt({n: spelt for n, spelt in given.items() if OWN + n not in moved})
             compare.make_all()
     except OptionError:  # also from a preconditioner of ours

@@ -27,12 +27,12 @@ CAUSES = {
 class OverlapWatch:
     """What the contacts of a scene may overlap by, as parts of half thicknesses, and what steps show.
 
-    Attributes: springs: by weight, tools and falls, 0 of rigid contacts; steps: by the way of bodies and the solver in
+    Attributes: elastic: by weight, tools and falls, 0 of rigid contacts; steps: by the way of bodies and the solver in
     a step; cause: of the worst overlap so far, a key of CAUSES, "" if there is none
     """
 
     def __init__(self, scene: Scene, settings: Settings, stiffness: float) -> None:
-        self.springs = expected_overlap(scene, stiffness, settings.dt)
+        self.elastic = expected_overlap(scene, stiffness, settings.dt)
         self._large = np.array([least_half(body) for body in scene.large_bodies], float)
         self._size, self._dt = smallest(scene), settings.dt
         closing = settings.limits.closing_speed
@@ -49,19 +49,19 @@ class OverlapWatch:
         found, held = overlaps(step, self._large)
         if self._start is None:
             self._start = found
-        least, springs = 0.5 * found, max(held, self._held)
-        cause = "stiffness" if springs >= least else "tol" if self._loose >= least else "dt"
+        least, elastic = 0.5 * found, max(held, self._held)
+        cause = "stiffness" if elastic >= least else "tol" if self._loose >= least else "dt"
         self._held, self._loose = held, closing_speed * self._dt / self._size
         if found > self._worst:
             self._worst, self.cause = found, cause
-        if found <= max(TWICE * (self.springs + self.steps), self._start) or cause in self._told:
+        if found <= max(TWICE * (self.elastic + self.steps), self._start) or cause in self._told:
             return ""
         self._told.add(cause)
         return cause
 
     def words(self, cause: str, step: int, program: bool) -> str:
         """What is said of that; the program has other names of options than Python."""
-        promised = self.springs + self.steps
+        promised = self.elastic + self.steps
         return (
             f"step {step}: bodies overlap by {self._worst:.2g} half thicknesses, where up to {promised:.2g} were "
             f"expected: {CAUSES[cause]}. What helps: {remedy(cause, program)}"

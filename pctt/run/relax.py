@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from dem.model.world import World
-from dem.parts.sources import Passages
+from dem.parts.passages import Passages
 from dem.scene import Scene, least_half
 from dem.start import refuse_overlap
 from dem.step.impulses import ImpulseMemory

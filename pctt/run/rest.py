@@ -66,8 +66,8 @@ def with_islands(
     if not count:
         return found
     limits, rows = _aimed(limits, world, part), problem.cones.rows_of(contacts)
-    with problem.part(contacts) as alone:
-        finer = solve(alone, guess[rows], limits)
+    with problem.part(contacts) as part_problem:
+        finer = solve(part_problem, guess[rows], limits)
     account(world, limits, finer)
     return with_part(problem, found, rows, finer) if finer.converged else found
 

@@ -142,7 +142,7 @@ class Settings(ccp.Limits):
         law = "Coulomb's law" if self.law == ccp.COULOMB else "relaxation of Coulomb's law"
         return f"{self.solver} to {self.tol:g}, {law}"
 
-    def of(self, scene: Experiment, relaxed: bool = False) -> Settings:
+    def completed_for(self, scene: Experiment, relaxed: bool = False) -> Settings:
         """The same, with what a scene and a solver have of their own where nothing is given; then ``options`` is an
         instance. The law is the relaxation with `pdip`, and where the run is ``relaxed`` by its kind, as comparisons
         are. OptionError for a bad value."""

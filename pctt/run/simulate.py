@@ -64,7 +64,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     if sim.dt_reason:
         progress.say(report.dt_line(settings.dt, sim.dt_reason))
     watch = sim.overlap_watch
-    progress.say(report.stiffness_line(sim.world.pairs.stiffness, watch.springs, watch.steps))
+    progress.say(report.stiffness_line(sim.world.pairs.stiffness, watch.elastic, watch.steps))
     if settings.tol > report.LOOSE:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE_BECAUSE}")
     solver = ccp.SOLVERS[settings.solver]

@@ -268,9 +268,9 @@ def _tell_other_origin(path: Path, old: dict[str, Any], new: dict[str, Any], com
     before, now = json.loads(old["figures"]), json.loads(new["figures"])
     names = [name for name in {**now, **before} if before.get(name) != now.get(name)]
     if names:
-        told = ", ".join(f"{name} {value(before, name)}, now {value(now, name)}" for name in names[:10])
+        differences = ", ".join(f"{name} {value(before, name)}, now {value(now, name)}" for name in names[:10])
         holds = "gravity and laws of contact are those of now, masses, sizes and materials those of before"
-        warn(comm, f"{path} was made with {told}{', and more' * (len(names) > 10)}; {holds}")
+        warn(comm, f"{path} was made with {differences}{', and more' * (len(names) > 10)}; {holds}")
     for name, what in {"scene_file": "another text of the scene file", "surfaces": "other surfaces of bodies"}.items():
         if old[name] != new[name]:
             warn(comm, f"{path} was made with {what}: {old[name][:200] or 'none'}, now {new[name][:200] or 'none'}")
@@ -368,7 +368,7 @@ def _settle(
     tenth, tol, begun = max(1, end // 10), settings.settle_tol, time.perf_counter()
     say(f"settling {scene_name(experiment)}, {end} steps with APGD to {tol:g}:")
     loose = Settings(dt=dt, delta=falling, solver="apgd", tol=tol, law=ccp.RELAXATION, overlap=settings.overlap)
-    loose = loose.of(experiment)
+    loose = loose.completed_for(experiment)
     world = world_at_start(experiment, loose, scene, comm)
     memory = ImpulseMemory(comm, world.pairs.parts, world.pairs.columns)
     if comm.bcast(unfinished(path).exists()):

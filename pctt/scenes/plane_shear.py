@@ -14,7 +14,7 @@ from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
 from dem.packing import perturbed, random_packing
 from dem.parts.cell import PASSING, SHEARED
-from dem.parts.sources import Uniform
+from dem.parts.sizes import Uniform
 from dem.record import cell
 from dem.record.analysis import calm
 from dem.scene import Scene

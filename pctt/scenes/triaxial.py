@@ -14,7 +14,7 @@ from dem.checks import between, not_negative, positive
 from dem.experiment import Experiment, option
 from dem.packing import random_packing
 from dem.parts.cell import PASSING, STRAINED
-from dem.parts.sources import Uniform
+from dem.parts.sizes import Uniform
 from dem.record import cell
 from dem.record.analysis import calm
 from dem.scene import Scene

@@ -140,14 +140,14 @@ class CostEstimate:
 
     each : the cost of an application, that of a product with the matrix is 1
     norms : of the residuals of conjugate gradients with it
-    alone : of those without a preconditioner, as far as they were tried, on a part of the matrix. Its eigenvalues lie
-        between those of the whole, so the whole takes as many iterations at least
+    unpreconditioned : of those without a preconditioner, as far as they were tried, on a part of the matrix. Its
+        eigenvalues lie between those of the whole, so the whole takes as many iterations at least
     spent : what the trials have cost, in products with the matrix
     """
 
     each: float
     norms: Sequence[float]
-    alone: Sequence[float]
+    unpreconditioned: Sequence[float]
     spent: float = 0.0
 
     @property

@@ -54,7 +54,8 @@ def compress_cross(
     matrix: SparseHierarchy | EntryMatrix, max_rank: int = 10, eps: float = 1e-2, start: Cross | None = None,
     sweeps: int = 10, rng: np.random.Generator | None = None, work: Work | None = None,
 ) -> Cross:  # fmt: skip
-    """A train with ranks at most `max_rank` from entries of the matrix. Its error is about eps if the rank allows it.
+    """Return a train with ranks at most `max_rank` from entries of the matrix. Its error is about eps if the rank
+    allows it.
 
     The final error of a sparse matrix is measured, at a cost linear in the nonzeros; that of a matrix given by a
     function is estimated from fresh samples. All other costs are sublinear.

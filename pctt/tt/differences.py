@@ -145,15 +145,15 @@ class Differences:
         """
         n = self.shape[axis]
         values = np.moveaxis(values, axis, 0)
-        back = np.minimum(n - np.arange(n), n - 1) if self.even else np.arange(n) - n
-        return values[:n], values[back], (np.arange(n) / n).reshape(-1, *[1] * (values.ndim - 1))
+        opposite = np.minimum(n - np.arange(n), n - 1) if self.even else np.arange(n) - n
+        return values[:n], values[opposite], (np.arange(n) / n).reshape(-1, *[1] * (values.ndim - 1))
 
     def circulant(self) -> Array:
         """The differences (n_1, ..., n_D, b, b) of the nearest circulant."""
         values = self.values
         for axis in range(len(self.shape)):
-            here, back, part = self._along(axis, values)
-            values = np.moveaxis((1 - part) * here + part * back, 0, axis)
+            here, opposite, part = self._along(axis, values)
+            values = np.moveaxis((1 - part) * here + part * opposite, 0, axis)
         return values
 
     @property
@@ -164,8 +164,8 @@ class Differences:
         sizes[(0,) * len(self.shape)] = 0.0
         largest, found = sizes.max() or 1.0, []
         for axis in range(len(self.shape)):
-            here, back, _ = self._along(axis, self.values)
-            found.append(float(np.abs(here - back)[1:].max(initial=0.0) / largest))
+            here, opposite, _ = self._along(axis, self.values)
+            found.append(float(np.abs(here - opposite)[1:].max(initial=0.0) / largest))
         return found
 
     def distance(self, transform: str) -> float:
@@ -407,7 +407,7 @@ def choose(a: Differences) -> Choice | None:
             continue
         kinds = kinds[:most] + [NOTHING] * (NOTHING in kinds[most:])
         for part in pieces:
-            trial = _Trial.of(part, kinds)
+            trial = _Trial.run_with(part, kinds)
             if trial is None:
                 return None
             trials.append(trial)
@@ -443,7 +443,7 @@ class _Trial:
         self.costs = dict(zip(self.runs, race(list(self.runs.values()), SLACK, DEAR)))
 
     @classmethod
-    def of(cls, a: Differences, kinds: Sequence[Kind]) -> _Trial | None:
+    def run_with(cls, a: Differences, kinds: Sequence[Kind]) -> _Trial | None:
         """None if A is not positive definite."""
         inverses = {kind: FastInverse(a, kind) for kind in kinds}
         if not all(inverse.positive for inverse in inverses.values()):

@@ -66,7 +66,7 @@ def invert(
     S: Train, max_rank: int = 10, start: Train | None = None, sweeps: int | None = None, eps: float = 0.0,
     rng: np.random.Generator | None = None,
 ) -> Inverse:  # fmt: skip
-    """The inverse of a symmetric positive definite S with ranks at most `max_rank`.
+    """Return the inverse of a symmetric positive definite S with ranks at most `max_rank`.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def invert_near_identity(
     T: Train, max_rank: int = 10, start: Train | None = None, sweeps: int | None = None, eps: float = 0.0,
     rng: np.random.Generator | None = None, work: Work | None = None,
 ) -> Inverse:  # fmt: skip
-    """The inverse of S = I + T as X = I + Z, with an exact identity; arguments as in `invert`.
+    """Return the inverse of S = I + T as X = I + Z, with an exact identity; arguments as in `invert`.
 
     The ranks of X are at most `max_rank`, those of Z one less. With rank 1, Z = 0. The start is an earlier Z. `work`
     counts operations. Near its limit the ranks do not grow any more, and at the limit the result of the last whole
@@ -118,7 +118,7 @@ def invert_positive(
 
 
 def residual(S: Train, X: Train, B: Train | None = None) -> float:
-    """||B - S X||_F / ||B||_F in train arithmetic; by default B is the identity.
+    """Return ||B - S X||_F / ||B||_F in train arithmetic; by default B is the identity.
 
     The cost grows with the product of the ranks of S and X. If this product is high, the result is an estimate from
     products with random trains, with an error of about a third.
@@ -184,17 +184,17 @@ class Growing:
         self.z[0] = self.residual.rest(0, self.x[0])
         self.estimate = float(np.linalg.norm(self.z[0]))
 
-    def _step(self, k: int, way: int) -> None:
-        """Compute core k, and go to the next one (``way`` 1) or to the one before (-1)."""
+    def _step(self, k: int, direction: int) -> None:
+        """Compute core k, and go to the next one (``direction`` 1) or to the one before (-1)."""
         x, z = self.x, self.z
         self._solve(k)
-        left, right = (self.galerkin, self.residual)[::way]
+        left, right = (self.galerkin, self.residual)[::direction]
         new = left.rest_left(right, k, x[k])  # (a, m, n, z) or (z, m, n, b)
         z[k] = self.residual.rest(k, x[k])
-        _push(x, self.signs, k, way, self.most[min(k, k + way)], self.drop, new)
-        z[k] = columns(z[k]) if way > 0 else rows(z[k])
-        self.galerkin.step(k, way, x[k], x[k])
-        self.residual.step(k, way, z[k], x[k])
+        _push(x, self.signs, k, direction, self.most[min(k, k + direction)], self.drop, new)
+        z[k] = columns(z[k]) if direction > 0 else rows(z[k])
+        self.galerkin.step(k, direction, x[k], x[k])
+        self.residual.step(k, direction, z[k], x[k])
 
     def words(self, norm: float) -> str:
         """How far it is, for a message. norm : ||B||"""
@@ -326,18 +326,18 @@ def _with_signs(X: Train, most: list[int]) -> tuple[list[Array], list[Array]]:
 
 
 def _push(
-    x: list[Array], signs: list[Array], k: int, way: int, most: int, drop: float, more: Array | None = None
+    x: list[Array], signs: list[Array], k: int, direction: int, most: int, drop: float, more: Array | None = None
 ) -> None:
     """Give core k, as a matrix (a m n, b), at most ``most`` orthonormal columns, some of them from ``more``.
 
-    The next core takes the other factor. With ``way`` -1 the same for the rows (a, m n b), and the core before.
+    The next core takes the other factor. With ``direction`` -1 the same for the rows (a, m n b), and the core before.
     """
-    turn = (0, 1, 2, 3) if way > 0 else (3, 1, 2, 0)
-    here, there = (k, k + 1)[::way]
+    turn = (0, 1, 2, 3) if direction > 0 else (3, 1, 2, 0)
+    here, there = (k, k + 1)[::direction]
     core, more = x[k].transpose(turn), None if more is None else more.transpose(turn)
     Q, R, signs[there] = _basis(core, signs[here], signs[there], most, drop, more)
     x[k] = np.ascontiguousarray(Q.reshape(*core.shape[:3], -1).transpose(turn))
-    x[k + way] = np.tensordot(R, x[k + 1], 1) if way > 0 else np.tensordot(x[k - 1], R, (3, 1))
+    x[k + direction] = np.tensordot(R, x[k + 1], 1) if direction > 0 else np.tensordot(x[k - 1], R, (3, 1))
 
 
 def _basis(

@@ -32,9 +32,9 @@ class Projection:
             new.step(k, -1, y[k], x[k])
         return new
 
-    def step(self, k: int, way: int, y: Array, x: Array) -> None:
-        """Contract core k too: into the left interface (``way`` 1) or into the right one (-1)."""
-        if way > 0:
+    def step(self, k: int, direction: int, y: Array, x: Array) -> None:
+        """Contract core k too: into the left interface (``direction`` 1) or into the right one (-1)."""
+        if direction > 0:
             T = np.tensordot(self.left[k], x, (2, 0))  # (c, R, i', j, b)
             T = np.tensordot(self.S[k], T, ((0, 2), (1, 2)))  # (i, R', c, j, b)
             self.left[k + 1] = np.tensordot(y, T, ((0, 1, 2), (2, 0, 3)))
@@ -42,7 +42,7 @@ class Projection:
             T = np.tensordot(x, self.right[k], (3, 2))  # (a, i', j, c, R)
             T = np.tensordot(self.S[k], T, ((2, 3), (1, 4)))  # (R, i, a, j, c)
             self.right[k - 1] = np.tensordot(y, T, ((1, 2, 3), (1, 3, 4)))
-        if self.B is not None and way > 0:
+        if self.B is not None and direction > 0:
             self.left_B[k + 1] = np.tensordot(y, np.tensordot(self.left_B[k], self.B[k], 1), ((0, 1, 2), (0, 1, 2)))
         elif self.B is not None:
             T = np.tensordot(self.B[k], self.right_B[k], (3, 1))  # (R, i, j, c)
@@ -106,7 +106,8 @@ def rows(x: Array) -> Array:
 
 
 def lowest(X: Train) -> float:
-    """An upper bound of the least eigenvalue of a symmetric X; a negative value proves that X is not positive definite.
+    """Return an upper bound of the least eigenvalue of a symmetric X; a negative value proves that X is not positive
+    definite.
 
     It is the least v'Xv / v'v that an alternating search over trains v finds. Their rank is 8, or 4 with modes above
     8, which cost more.

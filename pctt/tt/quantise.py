@@ -22,7 +22,7 @@ MIDDLE = 4  # the modes between the first and the last
 
 
 def choose_modes(n: int, leaf: int = 16) -> tuple[int, ...]:
-    """Slot modes [first, MIDDLE, ..., MIDDLE, last] for n slots.
+    """Return slot modes [first, MIDDLE, ..., MIDDLE, last] for n slots.
 
     The first mode is at most 64. The last is the number between `leaf` and 5/4 `leaf` with the least padding. A
     small number of slots gets one or two modes. The application of a train of rank r with these modes costs about
@@ -45,12 +45,12 @@ def choose_modes(n: int, leaf: int = 16) -> tuple[int, ...]:
 
 
 def slots_of(modes: Sequence[int]) -> int:
-    """The number of slots (or scalars) that modes hold: their product."""
+    """Return the number of slots (or scalars) that modes hold: their product."""
     return prod(map(int, modes))
 
 
 def scalar_modes(modes: Sequence[int], block: int) -> tuple[int, ...]:
-    """Modes of the unknowns; the leaf has `block` unknowns per slot.
+    """Return modes of the unknowns; the leaf has `block` unknowns per slot.
 
     >>> scalar_modes([2, 4, 16], 3)
     (2, 4, 48)
@@ -84,7 +84,7 @@ def leading(modes: Sequence[int], limit: int) -> int:
 
 
 def merge(train: Train, groups: Sequence[int]) -> Train:
-    """The same train with merged neighbouring modes: groups[k] cores become core k.
+    """Return the same train with merged neighbouring modes: groups[k] cores become core k.
 
     >>> from pctt.tt.train import identity
     >>> merge(identity([2, 3, 4, 5]), [2, 1, 1]).rows

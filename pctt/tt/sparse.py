@@ -275,7 +275,7 @@ def compress(
     matrix: SparseHierarchy, max_rank: int = 10, eps: float = 1e-2, start: Train | None = None,
     sweeps: int | None = None, rng: np.random.Generator | None = None,
 ) -> Compression:  # fmt: skip
-    """A train with ranks at most `max_rank`, with an error below eps if the rank allows it.
+    """Return a train with ranks at most `max_rank`, with an error below eps if the rank allows it.
 
     Parameters
     ----------
@@ -338,7 +338,7 @@ def backward(matrix: SparseHierarchy, last: Array, core_of: Callable[[int, Array
 
 
 def relative_error(matrix: SparseHierarchy, train: Train) -> float:
-    """||A - T||_F / ||A||_F over all entries, including zeros.
+    """Return ||A - T||_F / ||A||_F over all entries, including zeros.
 
     It is computed from ||A||^2 - 2 <A, T> + ||T||^2. Rounding makes this worthless below the root of the machine
     precision; so the result is at least CERTAIN.

@@ -259,7 +259,7 @@ class Train:
 def decompose(
     tensor: ArrayLike, eps: float = 1e-12, max_rank: int | None = None, modes: Sequence[int] | None = None
 ) -> Train:
-    """A train of a dense tensor with an error of at most eps times its norm: Algorithm 1 of the paper (TT-SVD).
+    """Return a train of a dense tensor with an error of at most eps times its norm: Algorithm 1 of the paper (TT-SVD).
 
     modes : the tensor is reshaped to these modes first (this quantises a vector).
 
@@ -282,7 +282,7 @@ def decompose_matrix(
     matrix: ArrayLike, rows: Sequence[int], columns: Sequence[int] | None = None, eps: float = 1e-12,
     max_rank: int | None = None,
 ) -> Train:  # fmt: skip
-    """A train of a dense matrix (prod rows, prod columns) with an error of at most eps times its norm.
+    """Return a train of a dense matrix (prod rows, prod columns) with an error of at most eps times its norm.
 
     >>> decompose_matrix(np.diag(np.ones(15), 1), [2, 2, 4]).ranks
     (1, 2, 2, 1)
@@ -297,18 +297,18 @@ def decompose_matrix(
 
 
 def matrix_train(cores: Iterable[Array], rows: Sequence[int], columns: Sequence[int] | None = None) -> Train:
-    """A matrix from cores (r, m n, r') that have pairs of indices as one mode."""
+    """Return a matrix from cores (r, m n, r') that have pairs of indices as one mode."""
     columns = rows if columns is None else columns
     return Train(core.reshape(core.shape[0], m, n, core.shape[-1]) for core, m, n in zip(cores, rows, columns))
 
 
 def identity(modes: Sequence[int]) -> Train:
-    """The identity matrix, of rank 1."""
+    """Return the identity matrix, of rank 1."""
     return Train([np.eye(n)[None, :, :, None] for n in modes])
 
 
 def zeros(rows: Sequence[int], columns: Sequence[int] | None = None) -> Train:
-    """The zero vector, or with ``columns`` the zero matrix, of rank 1."""
+    """Return the zero vector, or with ``columns`` the zero matrix, of rank 1."""
     return Train([np.zeros((1, *mode, 1)) for mode in _mode_shapes(rows, columns)])
 
 
@@ -316,7 +316,8 @@ def random(
     rows: Sequence[int], rank: int | Sequence[int], columns: Sequence[int] | None = None,
     rng: np.random.Generator | None = None,
 ) -> Train:  # fmt: skip
-    """A train with normally distributed cores, whose entries have the variance 1. No rank exceeds what the modes allow.
+    """Return a train with normally distributed cores, whose entries have the variance 1. No rank exceeds what the modes
+    allow.
 
     rank : the rank of all bonds, or the ranks r_1, ..., r_{d-1}.
 

@@ -113,7 +113,7 @@ def assembled(state: State, contacts: Contacts) -> Step:
     position = contacts.near.bodies.position
     arms = [contacts.point - half - position[contacts.a], contacts.point + half - position[contacts.b]]
     arm = np.ascontiguousarray(np.hstack(arms))
-    G = ContactMap(COMM, replace(system.contact_map.given, arm=arm))
+    G = ContactMap(COMM, replace(system.contact_map.source, arm=arm))
     r = system.b + G.relative_velocities(np.vstack([system.free_velocity, np.zeros(6)]))
     on_floor = contacts.body[:, 1] == world.slabs[-1] + _floor(world)
 

@@ -147,7 +147,7 @@ FEATURES = {
     ("dem/parts/joints.py", "contact_map/mass.py")),
     "sources": Feature("a source", bed, rained,
     ("dem/parts/sources.py", "dem/record/passage.py", "dem/geometry/insertion.py")),
-    "outlets": Feature("an outlet", bed, drained, ("dem/parts/sources.py", "dem/record/passage.py")),
+    "outlets": Feature("an outlet", bed, drained, ("dem/parts/passages.py", "dem/record/passage.py")),
     "clumps": Feature("clumps of two spheres for spheres", bed, partial(bed, grains="clumps"),
     ("contact/clumps.py", "dem/shapes/clumps.py")),
     "polyhedra": Feature("polyhedra of 20 faces for boxes", partial(bed, grains="boxes"),

@@ -157,7 +157,7 @@ def read(path: str | Path) -> ccp.ConeProblem:
 
 def write(path: Path, problem: ccp.ConeProblem) -> None:
     """A problem of frames and arms, for `read`: in an FCLIB file it would lose them."""
-    G = vars(problem.contact_map.given)
+    G = vars(problem.contact_map.source)
     np.savez(path, r=problem.r, mu=problem.mu, point=problem.point, compliance=problem.compliance[:, :2], **G)
 
 

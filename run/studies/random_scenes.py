@@ -31,7 +31,7 @@ import pctt
 from dem.measures import Block
 from dem.mesh import Mesh
 from dem.motion import Dynamic, Glide, Guided, Held, Hinged, Oscillation, Rotation
-from dem.parts.sources import Uniform
+from dem.parts.sizes import Uniform
 from dem.scene import Scene
 from dem.shapes import Box, Capsule, Clump, Plane, Sphere
 from dem.together import SceneError

@@ -25,7 +25,7 @@ def solve(type, tol=1e-8, max_it=-1, options=None, comm=SELF, law=ccp.RELAXATION
 
 
 def test_auto_takes_apgd_where_it_is_quick():
-    result = solve("auto", 1e-3, options=Auto(few=100.0))
+    result = solve("auto", 1e-3, options=Auto(elimination=100.0))
     assert (result.converged, result.solver, result.newton_its, result.ksp_its) == (True, "apgd", 0, 0)
     assert result.iterations == solve("apgd", 1e-3).iterations
 
@@ -36,7 +36,7 @@ def test_auto_goes_over_to_conic_where_apgd_takes_long(law, contacts, tol, monke
     """To the end; for Coulomb's law, where contacts are not few, to the end of its path, from where APGD goes on. All
     iterations are counted."""
     monkeypatch.setattr(by_elimination, "FEW", 100)
-    options, coulomb, few = Auto(few=1.0, patience=0.3), law == ccp.COULOMB, contacts == 40
+    options, coulomb, few = Auto(elimination=1.0, patience=0.3), law == ccp.COULOMB, contacts == 40
     result = solve("auto", tol, options=options, law=law, contacts=contacts)
     begun = options.iterations(from_graph(*heap(contacts=contacts, bodies=contacts // 5), SELF), tol, coulomb, few)
     words = [f"apgd: {begun} iterations", "conic: ", "apgd: "][: 3 if coulomb and not few else 2]

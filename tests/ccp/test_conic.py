@@ -138,7 +138,7 @@ def test_no_breakdown(case, tol):
 def test_little_compliance_on_a_rank_deficient_heap(form):
     known, graph = heap(bodies=8)
     rigid = from_graph(known, graph)
-    problem = ConeProblem(SELF, rigid.r, rigid.mu, G=rigid.contact_map.given, compliance=1e-6)
+    problem = ConeProblem(SELF, rigid.r, rigid.mu, G=rigid.contact_map.source, compliance=1e-6)
     tol = 1e-9  # rounding ends it at 1e-10 to 1e-9
     check(problem, solve(problem, tol, form), tol)
 

@@ -63,7 +63,7 @@ def test_operators_that_are_no_numbers_are_refused_on_all_ranks(number):
     comm = MPI.COMM_WORLD
     known, graph = heap()
     problem = from_graph(known, graph, comm)
-    G = problem.contact_map.given
+    G = problem.contact_map.source
     values = known.N.copy()
     values[0, 7] = number
     if comm.rank == 0:
@@ -117,7 +117,7 @@ def test_a_shape_that_does_not_fit_on_one_rank_is_refused_on_all():
     problem = from_graph(known, graph, MPI.COMM_WORLD)
     mu = problem.mu[1:] if MPI.COMM_WORLD.rank else problem.mu
     with pytest.raises(ValueError, match=r"mu has the shape \(19,\); .*r has 20 contacts \(on rank 1 of 2\)"):
-        ConeProblem(MPI.COMM_WORLD, problem.r, mu, G=problem.contact_map.given)
+        ConeProblem(MPI.COMM_WORLD, problem.r, mu, G=problem.contact_map.source)
 
 
 @pytest.mark.parametrize("block", [1, 3])

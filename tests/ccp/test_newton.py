@@ -220,7 +220,7 @@ def test_methods_without_multipliers_refuse_them_as_unknowns():
 
 
 def test_few_contacts_are_never_kept_apart():
-    G, some = delassus.without_dense_columns(SELF, from_graph(*heap(3)).contact_map.given)
+    G, some = delassus.without_dense_columns(SELF, from_graph(*heap(3)).contact_map.source)
     assert not some
     assert G.rows == 40
 

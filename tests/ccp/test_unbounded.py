@@ -160,7 +160,7 @@ def test_one_squeezed_sphere_among_many_contacts_on_several_ranks():
     known, graph = heap()
     problem = from_graph(known, graph, comm)
     # a sphere of its own between two walls, on the last rank
-    G, last = problem.contact_map.given, comm.rank == comm.size - 1
+    G, last = problem.contact_map.source, comm.rank == comm.size - 1
     blocks = [np.hstack([side * np.eye(3), np.zeros((3, 3))]) for side in (1.0, -1.0)]
     r, mu, indptr, indices, data = problem.r, problem.mu, G.indptr, G.indices, G.blocks
     if last:

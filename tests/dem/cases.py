@@ -126,7 +126,7 @@ def dense_map(system: ContactSystem) -> Floats:
     """D' (3 nc, 6 bodies) of the local contacts."""
     body = system.near.index[system.contact_map.body]
     dense = np.zeros((len(system.key), 3, bodies_of(system), 6))
-    contact, arms = np.arange(len(body)), system.contact_map.given.arm.reshape(-1, 2, 1, 3)
+    contact, arms = np.arange(len(body)), system.contact_map.source.arm.reshape(-1, 2, 1, 3)
     for side, sign in ((0, -1.0), (1, 1.0)):
         dense[contact, :, body[:, side], :3] = sign * system.frame
         dense[contact, :, body[:, side], 3:] = sign * np.cross(arms[:, side], system.frame)

@@ -56,8 +56,8 @@ def test_products_are_those_of_the_definition(case, threads):
     system = ContactSystem(world, find_contacts(world, 0.03), unconstrained(world, 0.01))
     G, bodies = system.contact_map, bodies_of(system)
     assert comm.allreduce(len(system.key)) > 40
-    assert G.given.root.shape == (world.owned, width)
-    roots = np.concatenate(comm.allgather(root_blocks(G.given.root)))
+    assert G.source.root.shape == (world.owned, width)
+    roots = np.concatenate(comm.allgather(root_blocks(G.source.root)))
     D = dense_map(system).reshape(-1, bodies, 2, 3)
     dense = np.einsum("cbpi,bpij->cbpj", D, roots).reshape(len(D), -1)
     np.testing.assert_allclose(dense_scaled_map(system, comm), dense, atol=1e-13 * np.abs(dense).max(initial=1.0))
@@ -75,7 +75,7 @@ def test_products_are_those_of_the_definition(case, threads):
     G.through(G.weights(H), v[own], out)
     weighed = comm.allreduce(dense.T @ (dense @ v.ravel() * np.tile([2.0, 1.0, 1.0], G.rows))).reshape(-1, 6)
     np.testing.assert_allclose(out, v[own] + weighed[own], **close)
-    again = type(G)(comm, G.given)  # with a halo that is found from the numbers of the bodies
+    again = type(G)(comm, G.source)  # with a halo that is found from the numbers of the bodies
     np.testing.assert_allclose(again.momenta(g), G.momenta(g), **close)
     assert len(again.halo.ghosts) == len(G.halo.ghosts)  # none that no contact touches
 
@@ -100,7 +100,7 @@ def test_a_product_sends_one_message_to_each_rank_that_shares_a_ghost():
     comm = Counting(MPI.COMM_WORLD)
     world = new_world(heap(3, side=4, large=False), MPI.COMM_WORLD)
     system = ContactSystem(world, find_contacts(world, 0.05), unconstrained(world, 0.01))
-    given = system.contact_map.given
+    given = system.contact_map.source
     starts = offsets(MPI.COMM_WORLD, given.columns)
     owners = set(np.searchsorted(starts, given.body[given.body >= 0], side="right") - 1) - {comm.rank}
     holders = [rank for rank, theirs in enumerate(comm.allgather(owners)) if comm.rank in theirs]

@@ -215,6 +215,6 @@ def test_measures_are_the_same_on_several_ranks():
 
 def test_a_material_that_is_not_there_is_refused():
     data = dataclasses.replace(column(), material=np.array([0, 1, 0, 1]))
-    np.testing.assert_array_equal(data.of("other"), [False, True, False, True])
+    np.testing.assert_array_equal(data.of_material("other"), [False, True, False, True])
     with pytest.raises(ValueError, match="material 'third': allowed is one of one, other"):
-        data.of("third")
+        data.of_material("third")

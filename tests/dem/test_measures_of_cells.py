@@ -86,7 +86,7 @@ def test_a_cell_measures_as_its_images_do(period, shear):
             found = [measures.fields(each, region, (3, 4, 5), 0.2, kernel) for each in (one, other)]
             for a, b in zip(*found):
                 np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-9)
-        found = [measures.mixing(each, each.of("one"), region, (2, 2, 2)) for each in (one, other)]
+        found = [measures.mixing(each, each.of_material("one"), region, (2, 2, 2)) for each in (one, other)]
         np.testing.assert_allclose(found[0], found[1])  # NaN of one kind alone
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dem.packing import perturbed, random_packing
-from dem.parts.sources import Listed, Uniform
+from dem.parts.sizes import Listed, Uniform
 
 
 def gaps(position, radius, box, periodic):

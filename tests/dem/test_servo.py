@@ -100,7 +100,7 @@ def test_the_mass_scaled_map_of_a_hinged_body_has_one_direction():
     blocks = rows.blocks[rows.indices == 2].reshape(-1, 6)
     np.testing.assert_array_equal(blocks[:, :3], 0.0)
     np.testing.assert_allclose(np.cross(blocks[:, 3:], AXIS), 0.0, atol=1e-15)
-    compact = system.contact_map.given.root[-1, 6:]
+    compact = system.contact_map.source.root[-1, 6:]
     moment = 0.4 * 0.25 * 100.0 * 4 / 3 * np.pi * 0.125
     np.testing.assert_allclose(compact, (np.outer(AXIS, AXIS) / np.sqrt(moment))[np.triu_indices(3)], atol=1e-15)
 

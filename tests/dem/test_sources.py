@@ -5,7 +5,8 @@ import pytest
 
 from dem.geometry.insertion import inserted
 from dem.measures import Block, Cylinder
-from dem.parts.sources import Listed, Source, Tally, Uniform, bounds, numbers, points, reach
+from dem.parts.sizes import Listed, Uniform
+from dem.parts.sources import Source, Tally, bounds, numbers, points, reach
 from dem.scene import Scene
 from dem.shapes import Box, Capsule
 

@@ -141,7 +141,7 @@ def test_products_with_the_map_of_a_cell_are_those_of_a_matrix(turning):
     sim.run(steps=2)
     system, random = sim.last.system, np.random.default_rng(comm.rank)
     cell = system.cell._replace(root=np.array([2.0, 0.0, 3.0]))
-    given = system.contact_map.given
+    given = system.contact_map.source
     root, count = given.root, given.rows
     free, G = (system.problem_map.with_mass(mass) for mass in (InverseMass(root), CellMass(comm, root, cell)))
     g, other = random.normal(size=(2, G.rows, 3))

@@ -34,7 +34,7 @@ def is_matrix(mat: PETSc.Mat, A: np.ndarray, atol: float = 1e-9) -> None:
     np.testing.assert_allclose(of(mat), A, atol=atol)
     np.testing.assert_allclose(columns(mat, mat.multTranspose), A.T, atol=atol)
     np.testing.assert_allclose(gathered(mat.getDiagonal()), np.diag(A), atol=atol)
-    np.testing.assert_allclose(dense_of(Entries.of(mat), len(A)), A, atol=atol)
+    np.testing.assert_allclose(dense_of(Entries.of_mat(mat), len(A)), A, atol=atol)
     assert mat.norm(FROBENIUS) == pytest.approx(np.linalg.norm(A), abs=atol)
 
 

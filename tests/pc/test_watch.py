@@ -151,7 +151,7 @@ def test_a_wrong_choice_costs_twice_as_much_as_none(kind, entries, monkeypatch):
     def wrong(a: of.Differences) -> of.Choice:
         honest = CHOOSE(a).cost_estimate
         each = of.FastInverse(a, kind).each
-        return of.Choice(kind, CostEstimate(each, [1.0, 1e-1, 1e-8], honest.alone, honest.spent))
+        return of.Choice(kind, CostEstimate(each, [1.0, 1e-1, 1e-8], honest.unpreconditioned, honest.spent))
 
     monkeypatch.setattr(of, "choose", wrong)
     A = from_differences(entries, (60, 50))

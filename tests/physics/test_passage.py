@@ -7,7 +7,7 @@ from mpi4py import MPI
 from dem.measures import Block, Cylinder
 from dem.mesh import Mesh
 from dem.motion import Fixed, Glide
-from dem.parts.sources import Uniform
+from dem.parts.sizes import Uniform
 from dem.scene import Scene
 from dem.shapes import Box, Capsule, Plane, Sphere
 from pctt.options import OptionError

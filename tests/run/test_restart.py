@@ -136,7 +136,7 @@ def test_a_settled_state_is_known_by_its_scene_and_by_what_settled_it(tmp_path, 
 
     def path(scene=None, **changes):
         scene = scene or Mixer(n=2)
-        settings = Settings(**changes).of(scene)
+        settings = Settings(**changes).completed_for(scene)
         return settled_path(scene, settings, scene.build(), origin(scene, scene.build(), settings.dt))
 
     paths = [path(), *(path(Mixer(**more)) for more in ({"n": 3}, {"n": 2, "friction": 0.3}, {"n": 2, "seed": 5}))]

@@ -125,7 +125,7 @@ def accelerated_step(
 
     Returned are, for each part of the contacts of this rank (parts, 3), d'Cd and |d|^2 of d = out - z, and
     y_z'(out - x); z and y_z are nowhere stored. A contact moves 64 bytes in single precision, 52 without compliance."""
-    part, way, soft, count = x.dtype.type(beta), x.dtype.type(step), len(compliance) > 0, len(mu)
+    part, step_length, soft, count = x.dtype.type(beta), x.dtype.type(step), len(compliance) > 0, len(mu)
     x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
     sums = np.zeros(((count + PART - 1) // PART, 3))
     for k in prange(len(sums)):
@@ -142,7 +142,7 @@ def accelerated_step(
                 y_z[: b - a] = y[a:b]
             if de_saxce:
                 _add_de_saxce(y_z, friction)
-            _step(z, y_z, way, friction, to[a:b])
+            _step(z, y_z, step_length, friction, to[a:b])
             add_squares(to[a:b], z, squares)
             add_products(to[a:b], x[a:b], y_z, products)
             if soft:

@@ -147,7 +147,7 @@ def accelerated_step(
     """`pctt.ccp.cones.friction.accelerated_step` for these cones: both halves of the rows go through strips."""
     mu, rho, sigma = coefficients
     count, soft = len(sigma), len(compliance) > 0
-    part, way, saxce = x.dtype.type(beta), x.dtype.type(step), x.dtype.type(de_saxce)
+    part, step_length, saxce = x.dtype.type(beta), x.dtype.type(step), x.dtype.type(de_saxce)
     x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
     z, y_z, turns = np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype)
     squares, products = np.zeros(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
@@ -164,7 +164,7 @@ def accelerated_step(
         else:
             y_z[: b - a] = y[a:b]
         _add_de_saxce(y_z, y[d:e], saxce, friction, rolling, here)
-        _step(z, y_z, turns, y[d:e], way, (friction, rolling, here), to[a:b], to[d:e])
+        _step(z, y_z, turns, y[d:e], step_length, (friction, rolling, here), to[a:b], to[d:e])
         add_squares(to[a:b], z, squares)
         add_squares(to[d:e], turns, squares)
         add_products(to[a:b], x[a:b], y_z, products)

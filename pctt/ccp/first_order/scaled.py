@@ -261,8 +261,8 @@ class Progress:
         Before there was a step it is taken for RATIO times |L step| / |x|."""
         residual, size_then = self._last_look
         wanted = self.limits.tol if self._met is None else self.limits.aimed
-        few = self._next_look - self.check + 3
-        if self.iterations >= few and residual * size <= 0.9 * wanted * size_then:
+        early = self._next_look - self.check + 3
+        if self.iterations >= early and residual * size <= 0.9 * wanted * size_then:
             self._next_look = self.iterations
         self._size = size
         return self.iterations >= min(self._next_look, self.limits.max_it)

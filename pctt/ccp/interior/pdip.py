@@ -61,7 +61,7 @@ class PDIP:
     short: float = number(0.5, "the direction of a shorter step is corrected; without, 1.7 times the Newton steps")
     reach: float = number(0.3, "how much further than the short step the corrected one is to reach")
     longer: float = number(1.2, "times longer that the corrected step must be; else Newton's direction is better")
-    back: float = number(0.8, "factor on a step that leaves the neighbourhood, so a fifth too short at most")
+    backtracking: float = number(0.8, "factor on a step that leaves the neighbourhood, so a fifth too short at most")
     least: float = number(1e-10, "shorter steps change the impulses by less than the tightest tolerance asks")
     late: float = number(1e-3, "natural residual below which S has a proximal term; `_next_damping`")
 
@@ -267,7 +267,7 @@ class Linearised(NamedTuple):
             mean = problem.sum(gap.sum()) / problem.size
             if problem.min(gap.min(initial=np.inf)) >= options.neighbourhood * mean:
                 break
-            step *= options.back
+            step *= options.backtracking
         return step
 
 

@@ -41,6 +41,7 @@ from pctt.petsc import options_database
 FORMS: dict[str, Callable[[ConeProblem], System]] = {"contact": ContactForm, "body": BodyForm, "kkt": KKTForm}
 Linear = Union[ByKSP, ByFactors, ByElimination]
 _ASKED = {OWN + "pc_type", OWN + "ksp_type"}  # options that say how a system is to be solved
+_OF_KSP = (OWN + "ksp_", OWN + "pc_")
 
 
 class Newton:
@@ -72,8 +73,9 @@ class Newton:
     @property
     def of_parts(self) -> Newton:
         """Another one of the same choice, for a part of a problem that is solved beside the whole: each keeps its
-        structure from step to step. This one itself if preconditioners are compared."""
-        if self.compare is not None:
+        structure from step to step. This one itself if preconditioners are compared, or the options say something
+        of KSPs: two would write into one file."""
+        if self.compare is not None or any(name.startswith(_OF_KSP) for name in options_database()):
             return self
         self._of_parts = self._of_parts or Newton(self.comm, self.form)
         return self._of_parts

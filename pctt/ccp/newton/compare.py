@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from pctt import log
 from pctt.blocks import shell_of
-from pctt.ccp.newton.krylov import Krylov, Solve, Source
+from pctt.ccp.newton.krylov import Krylov, Pmat, Solve
 from pctt.ksp_options import OWN
 from pctt.options import OptionError
 
@@ -55,7 +55,7 @@ class Comparison:
         self._seen += 1
         return (self._seen - 1) % self.every == 0
 
-    def run(self, A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: Source = None) -> Solve:
+    def run(self, A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float, P: Pmat = None) -> Solve:
         """All preconditioners on one system; x is of the first that converged, else of the best.
 
         The seconds of the others count in the phase `compare`, not in `solve`: a run without comparison does not spend
@@ -81,7 +81,7 @@ class Comparison:
         """The preconditioners that read entries beside the diagonal blocks."""
         return [name for name in self.names if self._solver(name).needs_entries]
 
-    def _make_entries(self, A: PETSc.Mat, P: Source) -> None:
+    def _make_entries(self, A: PETSc.Mat, P: Pmat) -> None:
         """Where A is a function, its entries, once for all that read them: no one's set-up."""
         if callable(P) and shell_of(A) and self.readers:
             start = time.perf_counter()

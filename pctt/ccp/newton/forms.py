@@ -32,7 +32,7 @@ from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.defaults import DIRECT, MULTIFRONTAL, Options
 from pctt.ccp.newton.elimination import Order
 from pctt.ccp.newton.kkt import KKT
-from pctt.ccp.newton.krylov import Source
+from pctt.ccp.newton.krylov import Pmat
 from pctt.ccp.newton.multifrontal import Dissection, MultifrontalFactors
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ class ContactForm(Form):
         return DIRECT[self.symmetric]
 
     @contextmanager
-    def to_factor(self, least: float) -> Iterator[Source]:
+    def to_factor(self, least: float) -> Iterator[Pmat]:
         """What is to be factorised."""
         yield self.entries
 
@@ -246,7 +246,7 @@ class BodyForm(Form):
         return MULTIFRONTAL if self.symmetric else DIRECT[False]
 
     @contextmanager
-    def to_factor(self, least: float) -> Iterator[Source]:
+    def to_factor(self, least: float) -> Iterator[Pmat]:
         """K without blocks below ``least`` (`BodyMatrix.stiff_part`), in scalar rows."""
         part = self.operator.entries().stiff_mat(least, self.symmetric)
         yield part

@@ -19,7 +19,7 @@ from pctt.ksp_options import OWN, entered, mark_used, to_enter, unmarked
 from pctt.petsc import options_database, own_errors, set_skip_pc
 
 # the Mat from which a preconditioner is made, or a function that makes it, for those that read entries
-Source = Union[PETSc.Mat, Callable[[], PETSc.Mat], None]
+Pmat = Union[PETSc.Mat, Callable[[], PETSc.Mat], None]
 # right preconditioning makes the residual that the method sees the true one
 _RIGHT_SIDED = {"bcgs", "gmres", "tfqmr", "cgs"}
 _BY_PRODUCTS = {"none", "jacobi", "pbjacobi"}  # these need no entries beside the diagonal blocks
@@ -120,7 +120,7 @@ class Krylov:
         b: PETSc.Vec,
         x: PETSc.Vec,
         rtol: float | None = None,
-        P: Source = None,
+        P: Pmat = None,
         keep: bool = False,
     ) -> Solve:
         """x = A^-1 b from zero. If a set-up or a solve breaks down on any rank, the result says so; nothing is raised.
@@ -178,7 +178,7 @@ class Krylov:
             with entered(continued, hidden=own), set_skip_pc(self.ksp):
                 self.ksp.setFromOptions()
 
-    def _set_up(self, A: PETSc.Mat, P: Source, keep: bool) -> None:
+    def _set_up(self, A: PETSc.Mat, P: Pmat, keep: bool) -> None:
         if not self._has_viewers:
             self._read_viewers()
         self.ksp.pc.setReusePreconditioner(keep)

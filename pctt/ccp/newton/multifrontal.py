@@ -64,9 +64,9 @@ class Dissection(NamedTuple):
         """Whether it can be the order of a matrix with entries of these bodies: its first bodies have no neighbours
         there, and no entry joins the parts of two ranks."""
         front, rank = (of_place[self.places] for of_place in (self.front_of(np.arange(len(self.order))), self.ranks))
-        alone = (row != column) & (np.minimum(front[row], front[column]) < 0)
+        separate = (row != column) & (np.minimum(front[row], front[column]) < 0)
         one, other = rank[row], rank[column]
-        return not (alone | ((one >= 0) & (other >= 0) & (one != other))).any()
+        return not (separate | ((one >= 0) & (other >= 0) & (one != other))).any()
 
     def front_of(self, places: np.ndarray) -> np.ndarray:
         """The fronts to which these places in the order belong; -1: none."""
