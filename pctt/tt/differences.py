@@ -391,9 +391,9 @@ def choose(a: Differences) -> Choice | None:
     """The preconditioner with which conjugate gradients cost least; None if A is not positive definite.
 
     It is found on small parts of the grid: on lines, on lines that are twice as wide, and on parts with all axes. What
-    costs OUT times as much as another is not tried further. Beside none as many are tried as cost PART of a solution,
-    which costs as much as on the hardest part at least; on the last parts two are. The smallest sum over all parts
-    wins, so the harder parts count more. If a grid is too small for trials, the most promising one is taken.
+    costs OUT times as much as another is not tried further. Beside none and circulants as many are tried as cost PART
+    of a solution, which costs as much as on the hardest part at least; on the last parts two are. The smallest sum over
+    all parts wins, so the harder parts count more. If a grid is too small for trials, the most promising one is taken.
     """
     if max(a.aperiodic) <= 1e-12:  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
@@ -405,7 +405,7 @@ def choose(a: Differences) -> Choice | None:
         most = max(least, int((PART - _spent(trials, size) / solution) / share))
         if share > PART or min(most, len(kinds)) < 2:
             continue
-        kinds = kinds[:most] + [NOTHING] * (NOTHING in kinds[most:])
+        kinds = kinds[:most] + [kind for kind in kinds[most:] if kind in (NOTHING, CIRCULANT)]
         for part in pieces:
             trial = _Trial.of(part, kinds)
             if trial is None:
