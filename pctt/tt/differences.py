@@ -15,7 +15,6 @@ sign. So errors at the boundary have opposite signs, and a mean of both inverses
 only the mean of a over the signs of the coordinates. If A differs much from it (rotated anisotropy), circulants are
 better, and so is a part of the inverse of the circulant on a grid twice as wide that has A as a part.
 
-
 Each of these matrices C makes the trace of C^-1 A as large as that of I. So the bound of Kaporin (Numer. Linear Algebra
 Appl. 1, 1994), by which conjugate gradients take fewer iterations the smaller trace^N / det is, depends on det C alone:
 of the transforms, the one with the smallest determinant is the best. Whether another preconditioner or none is better
