@@ -30,7 +30,7 @@ def exchange(comm: MPI.Comm, columns: Mapping[str, np.ndarray], destination: Int
     # All columns travel as one message: each row is the bytes of its entries side by side.
     packed = np.concatenate([_as_bytes(column) for column in columns.values()], axis=1)[order]
     ranks, first = np.unique(destination[order], return_index=True)
-    arrived = _delivered(comm, dict(zip(ranks.tolist(), np.split(packed, first[1:]))), packed[:0])
+    arrived = _received(comm, dict(zip(ranks.tolist(), np.split(packed, first[1:]))), packed[:0])
     out, start = {}, 0
     for name, column in columns.items():
         width = _as_bytes(column[:0]).shape[1]
@@ -40,7 +40,7 @@ def exchange(comm: MPI.Comm, columns: Mapping[str, np.ndarray], destination: Int
     return out
 
 
-def _delivered(comm: MPI.Comm, parts: dict[int, np.ndarray], none: np.ndarray) -> np.ndarray:
+def _received(comm: MPI.Comm, parts: dict[int, np.ndarray], none: np.ndarray) -> np.ndarray:
     """The rows that other ranks have for this one, in the order of the ranks; `parts`: the rows of bytes for each rank
     that gets some, `none`: no rows. Collective.
 
@@ -100,7 +100,7 @@ def reduced(
     return numbers[1 : len(sums) + 1].tolist(), numbers[len(sums) + 1 :].tolist()
 
 
-def told(comm: MPI.Comm, value: Out) -> Out:
+def broadcast(comm: MPI.Comm, value: Out) -> Out:
     """What the first rank has, on all ranks: processors may round in other ways. Collective."""
     return value if comm.size == 1 else comm.bcast(value)
 
@@ -124,7 +124,7 @@ _SUMS_AND_MOST = MPI.Op.Create(_sums_and_most, commute=True)
 Failure = tuple[type[Exception], str]
 
 
-def first_of(failures: Sequence[Failure | None]) -> Exception:
+def common_error(failures: Sequence[Failure | None]) -> Exception:
     """The error that all ranks raise, from the failures of each: that of the first that has one, with the ranks that
     have the same, if not all do."""
     failed = [rank for rank, failure in enumerate(failures) if failure]
@@ -151,14 +151,14 @@ def agreed(
     except own as error:
         found = failure(error)
     if on_any(comm, found is not None)[0]:
-        raise first_of(comm.allgather(found))
+        raise common_error(comm.allgather(found))
     return result
 
 
 def refuse(comm: MPI.Comm, wrong: str) -> None:
     """ValueError on all ranks if any rank has words for what is wrong with the user's data. Collective."""
     if on_any(comm, bool(wrong))[0]:
-        raise first_of(comm.allgather((ValueError, wrong) if wrong else None))
+        raise common_error(comm.allgather((ValueError, wrong) if wrong else None))
 
 
 def on_each(comm: MPI.Comm, what: str, work: Callable[[], Out]) -> Out:

@@ -14,16 +14,18 @@ import typing
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from dem import checks
 from dem.arrays import Floats
 from dem.options import option
 from dem.scene import Scene
-from dem.step import Step
 from dem.together import SCENE_FILE, in_words
 
-__all__ = ["Experiment", "Given", "SceneFileError", "from_file", "option"]
+if TYPE_CHECKING:
+    from dem.step import Step
+
+__all__ = ["Experiment", "SceneExperiment", "SceneFileError", "from_file", "option"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +84,7 @@ class Experiment:
         return {}
 
 
-class Given(Experiment):
+class SceneExperiment(Experiment):
     """A scene that is built already."""
 
     def __init__(self, scene: Scene):

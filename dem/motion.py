@@ -34,7 +34,7 @@ class Timed:
         if not (np.isfinite(self.start) and self.start <= self.end):
             raise ValueError(f"{type(self).__name__} cannot begin at {self.start:g} s and end at {self.end:g} s")
 
-    def gone(self, time: float) -> float:
+    def elapsed(self, time: float) -> float:
         """How much of the time between start and end has gone by [s]."""
         return max(min(time, self.end) - self.start, 0.0)
 
@@ -84,7 +84,7 @@ class Driven(Dynamic, Timed):
 
     def strength(self, time: float, dt: float) -> float:
         """The greatest mean force or torque from `time` to `time + dt` [s]."""
-        return float(getattr(self, self._strength) * (self.gone(time + dt) - self.gone(time)) / dt)
+        return float(getattr(self, self._strength) * (self.elapsed(time + dt) - self.elapsed(time)) / dt)
 
     def mean_drive(self, time: float, dt: float, lack: float) -> Floats:
         """Mean force or torque (3,) of the drive from `time` to `time + dt` [s]; of a servo what lacks to the speed at
@@ -190,7 +190,7 @@ class Held(Dynamic, Timed):
     def held(self, time: float, dt: float) -> Floats:
         """The velocity (6,) that is held, its mean from `time` to `time + dt` [s]; zero where it is free."""
         values = np.array([value or 0.0 for value in (*self.velocity, *self.angular_velocity)])
-        return (self.gone(time + dt) - self.gone(time)) / dt * values
+        return (self.elapsed(time + dt) - self.elapsed(time)) / dt * values
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ class Rotation(Timed):
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
-        turn = quaternion.exponential(self.gone(time) * np.array(self.velocity))
+        turn = quaternion.exponential(self.elapsed(time) * np.array(self.velocity))
         center = np.array(self.center)
         turned = quaternion.normalized(quaternion.multiply(turn, orientation))
         return center + quaternion.rotate(turn, position - center), turned
@@ -242,7 +242,7 @@ class Oscillation(Timed):
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
-        angle = 2.0 * np.pi * self.gone(time) / self.period
+        angle = 2.0 * np.pi * self.elapsed(time) / self.period
         swing = np.sin(angle + self.phase) - np.sin(self.phase)
         return position + self.amplitude * swing * np.array(self.direction), orientation
 
@@ -261,7 +261,7 @@ class Glide(Timed):
 
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
-        return position + self.gone(time) * np.array(self.velocity), orientation
+        return position + self.elapsed(time) * np.array(self.velocity), orientation
 
 
 @dataclass(frozen=True)
@@ -391,6 +391,6 @@ def changed(motion: Motion, time: float, **values: Any) -> Motion:
             raise ValueError(f"{type(motion).__name__} has no {name}; it has {', '.join(names) or 'no parameters'}")
     after = dataclasses.replace(motion, **values)
     if isinstance(motion, Oscillation) and isinstance(after, Oscillation) and "phase" not in values:
-        turns = motion.gone(time) / motion.period - after.gone(time) / after.period
+        turns = motion.elapsed(time) / motion.period - after.elapsed(time) / after.period
         after = dataclasses.replace(after, phase=motion.phase + 2.0 * np.pi * turns)
     return after

@@ -116,7 +116,7 @@ def _apart(position: Floats, radius: Floats, box: Floats, cell: Cell, most: int)
 def _pairs(position: Floats, radius: Floats, cell: Cell) -> tuple[Floats, Floats, Floats]:
     """Rows (m,) and (m,) of spheres that touch, and the ways (m, 3) from the first to the second or its image."""
     source, moved, reach = [], [], 2.0 * radius.max()
-    for way in cell.ways:  # the first are those in the box
+    for way in cell.image_vectors:  # the first are those in the box
         image = position + way
         near = (((image > -reach) & (image < cell.period + reach)) | ~cell.axes).all(axis=1)
         source.append(np.flatnonzero(near))

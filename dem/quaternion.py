@@ -1,15 +1,19 @@
 """Unit quaternions (w, x, y, z) as rotations from the body frame to the world frame.
 
-Every function but `integrate` works on stacks: quaternions have shape (..., 4), vectors (..., 3).
+Every public function but `integrate` works on stacks: quaternions have shape (..., 4), vectors (..., 3).
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dem.arrays import Floats
 from dem.compiled import loop
+
+if TYPE_CHECKING:
+    from dem.arrays import Floats
 
 #: scipy takes and gives (x, y, z, w); its `scalar_first` came with 1.14.
 _TO_SCIPY, _FROM_SCIPY = [1, 2, 3, 0], [3, 0, 1, 2]
@@ -64,17 +68,19 @@ def rotate(q: Floats, v: Floats) -> Floats:
 
 def matrix(q: Floats) -> Floats:
     """Rotation matrices (..., 3, 3) from the body frame to the world frame."""
-    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    out = np.empty(q.shape[:-1] + (3, 3))
-    out[..., 0, 0] = 1 - 2 * (y * y + z * z)
-    out[..., 0, 1] = 2 * (x * y - w * z)
-    out[..., 0, 2] = 2 * (x * z + w * y)
-    out[..., 1, 0] = 2 * (x * y + w * z)
-    out[..., 1, 1] = 1 - 2 * (x * x + z * z)
-    out[..., 1, 2] = 2 * (y * z - w * x)
-    out[..., 2, 0] = 2 * (x * z - w * y)
-    out[..., 2, 1] = 2 * (y * z + w * x)
-    out[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    return _matrices(np.ascontiguousarray(q, dtype=float).reshape(-1, 4)).reshape(q.shape[:-1] + (3, 3))
+
+
+@loop
+def _matrices(q: Floats) -> Floats:
+    out = np.empty((len(q), 3, 3))
+    for n in range(len(q)):
+        w, x, y, z = q[n, 0], q[n, 1], q[n, 2], q[n, 3]
+        out[n, 0, 0], out[n, 1, 1] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z)
+        out[n, 2, 2] = 1 - 2 * (x * x + y * y)
+        out[n, 0, 1], out[n, 1, 0] = 2 * (x * y - w * z), 2 * (x * y + w * z)
+        out[n, 0, 2], out[n, 2, 0] = 2 * (x * z + w * y), 2 * (x * z - w * y)
+        out[n, 1, 2], out[n, 2, 1] = 2 * (y * z - w * x), 2 * (y * z + w * x)
     return out
 
 
@@ -113,3 +119,13 @@ def integrate(q: Floats, angular_velocity: Floats, dt: float) -> Floats:
         size = 1.0 / np.sqrt(e * e + f * f + g * g + h * h)
         out[n, 0], out[n, 1], out[n, 2], out[n, 3] = size * e, size * f, size * g, size * h
     return out
+
+
+def principal(tensor: Floats) -> tuple[Floats, Floats]:
+    """Principal moments (3,) and axes, as a quaternion (4,), of an inertia tensor (3, 3); where it is diagonal the axes
+    stay."""
+    moments, axes = np.diag(tensor).copy(), np.eye(3)
+    if np.abs(tensor - np.diag(moments)).max() > 1e-12 * moments.max():
+        moments, axes = np.linalg.eigh(tensor)
+        axes[:, 2] *= np.linalg.det(axes)  # right-handed
+    return moments, from_matrix(axes)

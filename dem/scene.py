@@ -14,6 +14,7 @@ by a `dem.arrays.Rule` takes no memory at all.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial, wraps
 from inspect import Parameter, signature
@@ -25,8 +26,8 @@ from mpi4py import MPI
 from dem import bodies, checks, quaternion, shapes
 from dem.arrays import ArrayLike, Floats, Ints, Rule, frozen
 from dem.bodies import BOX, CAPSULE, COMPOUND, PLANE, SPHERE, Bodies
+from dem.geometry.region import Block, Cylinder
 from dem.geometry.survey import Survey, survey
-from dem.measures import Block, Cylinder
 from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
 from dem.parts import cell, contact_law
 from dem.parts.contact_law import ContactLaw
@@ -169,7 +170,7 @@ def _building(method: Method) -> Method:
 
 class Scene:
     """Collects grains, large bodies, materials and gravity; checks each as it comes (ValueError). A scene of which a
-    simulation was made stays as it is; `copy.deepcopy` makes one that can be changed."""
+    simulation was made stays as it is; `copy` makes one that can be changed."""
 
     def __init__(
         self,
@@ -218,7 +219,7 @@ class Scene:
     def refuse_finished(self, what: str) -> None:
         """ValueError for a change once the scene is finished."""
         if self._finished:
-            allowed = "allowed are a copy.deepcopy(scene) for another one, and change(...) of the simulation"
+            allowed = "allowed are scene.copy() for another one, and change(...) of the simulation"
             raise ValueError(f"{what}: a simulation was made of this scene, and would not see the change; {allowed}")
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -228,6 +229,12 @@ class Scene:
                 raise AttributeError(f"a Scene has no {name!r} to set{checks.nearest(name, known)}")
             self.refuse_finished(name)
         super().__setattr__(name, value)
+
+    def copy(self) -> Scene:
+        """Return a scene with the same contents, which can be changed by itself."""
+        return deepcopy(self)
+
+    __copy__ = copy
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies, which can be changed."""
@@ -773,7 +780,7 @@ def _reframed(body: LargeBody, center: Floats, inner: Floats) -> LargeBody:
 def _centered(body: LargeBody, density: float) -> LargeBody:
     """The same body with its frame at the centre of mass along the principal axes, with mass and moments."""
     mass, center, tensor = shapes.mass_properties(body.shapes, density)
-    moments, turn = shapes.principal(tensor)
+    moments, turn = quaternion.principal(tensor)
     return replace(_reframed(body, center, turn), mass=mass, inertia=moments)
 
 

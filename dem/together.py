@@ -18,7 +18,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Floats
-from dem.exchange import first_of, reduced
+from dem.exchange import common_error, reduced
 
 Result = TypeVar("Result")
 
@@ -47,11 +47,11 @@ def together(
         failure = (type(error), str(error))
     except BaseException as error:  # also SystemExit, which would end this rank alone
         failure = (SceneError, f"{_place(error)}{what}: {in_words(error)}")
-    meet(comm, f"the end of the {what}", failure)
+    barrier(comm, f"the end of the {what}", failure)
     return result
 
 
-def meet(
+def barrier(
     comm: MPI.Comm, where: str, failure: tuple[type[Exception], str] | None = None, number: float = 0.0
 ) -> float:
     """Wait for all ranks at a place in the code of a scene; the sum of a number over them. Raises if one has failed or
@@ -62,7 +62,7 @@ def meet(
         return total
     places, failures = zip(*comm.allgather((where, failure)))
     if any(failures):
-        raise first_of(failures)
+        raise common_error(failures)
     listed = ", ".join(f"rank {rank} at {place}" for rank, place in enumerate(places))
     raise SceneError(f"the code of a scene must make the same calls on all ranks, but {listed}")
 
@@ -73,7 +73,7 @@ def digest(words: str) -> int:
     return int(hashlib.sha256(words.encode()).hexdigest()[:15], 16)
 
 
-def unlike(comm: MPI.Comm, words: str, numbers: Sequence[Floats] = (), rounding: float = 1e-11) -> int:
+def first_differing_rank(comm: MPI.Comm, words: str, numbers: Sequence[Floats] = (), rounding: float = 1e-11) -> int:
     """The first rank whose words or numbers are not those of rank 0; 0 if all are alike; collective.
 
     Of each array its shape and a sum with fixed weights are compared. Sums may differ by ``rounding`` times the largest

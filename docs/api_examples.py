@@ -424,12 +424,12 @@ sim = pctt.Simulation(Drop(height=0.5), dt=0.01)
 sim.run(until=0.2)
 print("gap", round(sim.figures["gap [m]"], 4), "m after 0.2 s; it was 0.5 m")
 
-# %% dem.experiment.Given
-from dem.experiment import Given
+# %% dem.experiment.SceneExperiment
+from dem.experiment import SceneExperiment
 from dem.scene import Scene
 
 scene = Scene(friction=0.5)
-print("a scene that is built already, as an experiment:", Given(scene).build() is scene)
+print("a scene that is built already, as an experiment:", SceneExperiment(scene).build() is scene)
 
 # %% dem.experiment.SceneFileError
 from pathlib import Path

@@ -54,7 +54,7 @@ ONLY = {
     "dem.unconstrained": ["UnconstrainedMotion", "unconstrained"],
     "dem.shapes": [
         "Plane", "Box", "Sphere", "Capsule", "Cylinder", "Superellipsoid", "Clump", "described", "placed", "solid",
-        "solid_properties", "mass_properties", "principal", "moved",
+        "solid_properties", "mass_properties", "moved",
     ],
     "dem.mesh": ["Mesh"],
     "dem.motion": ["Dynamic", "Fixed", "Glide", "Guided", "Held", "Hinged", "Oscillation", "Path", "Rotation"],

@@ -41,7 +41,7 @@ def sample(folder: Folder, step: int) -> Sample:
         center[:, 1] += contacts.moved
     row, side = np.nonzero(contacts.bodies < table.grains)  # points and grains were put into the cell each by itself
     point = contacts.point[row]
-    lattice = frame.lattice / stretch - contacts.dt * frame.drift / stretch[:, None]
+    lattice = (frame.lattice - contacts.dt * frame.drift / stretch[:, None]) / stretch
     center[row, side] = point + nearest_image(center[row, side] - point, lattice)
     return Sample(
         comm=MPI.COMM_SELF,

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
-Array = NDArray[np.float64]
+from pctt.arrays import Array
+
 Product = Callable[[Array, Array], None]
 
 

@@ -37,7 +37,7 @@ class FileError(RuntimeError):
 
 
 @contextmanager
-def told(path: Path) -> Iterator[None]:
+def naming(path: Path) -> Iterator[None]:
     """FileError for an OSError of the block, which writes ``path``."""
     try:
         yield
@@ -53,7 +53,7 @@ def whole(path: Path) -> Iterator[Path]:
     its place. After an error of any kind the old file is as it was, and the temporary file is removed. The name is this
     writer's alone: of several that write ``path`` at a time, the last one to end replaces the files of the others.
     """
-    with told(path):
+    with naming(path):
         if path.exists() and not path.is_file():
             raise OSError("it is no regular file")
         with _own_folder(path.parent) as own:
@@ -173,7 +173,7 @@ class Lock:
 def on_first(comm: MPI.Comm, path: Path, call: Callable[[], Found]) -> Found:
     """What the call, which writes ``path``, returns on the first rank; collective. FileError on all ranks if it raises
     one, or an OSError."""
-    return exchange.on_first(comm, told(path)(call))
+    return exchange.on_first(comm, naming(path)(call))
 
 
 class _Bytes(io.FileIO):

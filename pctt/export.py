@@ -23,7 +23,7 @@ from mpi4py import MPI
 
 from pctt.disk import FileError, hdf5, refuse_links, whole, write_text
 from pctt.folder import RUN_FILES, Folder, Frame
-from pctt.look.program import chosen, made_folder, parser, run, told_steps
+from pctt.look.program import chosen, described_steps, made_folder, parser, run
 
 SERIES = ("bodies", "contacts", "large")
 
@@ -43,7 +43,7 @@ def main(comm: MPI.Comm) -> None:
     if given.single:
         if comm.rank == 0:
             write_single(given.single, folder, steps)
-            print(f"{told_steps(folder, steps)}: {given.single}")
+            print(f"{described_steps(folder, steps)}: {given.single}")
         return
     target = made_folder(given.output or folder.path / "paraview")
 
@@ -70,7 +70,7 @@ def main(comm: MPI.Comm) -> None:
             else:
                 write_vtkhdf(target / f"{name}.vtkhdf", name, scene, steps)
         kind = "pvd" if given.format == "vtp" else "vtkhdf"
-        print(f"{told_steps(folder, steps)}: {target}/" + ", ".join(f"{name}.{kind}" for name in names))
+        print(f"{described_steps(folder, steps)}: {target}/" + ", ".join(f"{name}.{kind}" for name in names))
     comm.Barrier()  # all files exist when any rank returns
 
 

@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 from pctt.disk import whole
 from pctt.folder import Folder, Frame
-from pctt.look.program import View, checked, chosen, made_folder, parser, run, told_steps
+from pctt.look.program import View, checked, chosen, described_steps, made_folder, parser, run
 from pctt.options import POSITIVE, OptionError, made, nearest, refuse_bad
 
 PALETTE = ["-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=none"]  # of a GIF, of its own colours
@@ -86,7 +86,7 @@ def main(comm: MPI.Comm) -> None:
         draw(folder.frame(step)).save(picture)
     comm.Barrier()
     if comm.rank == 0:
-        print(f"{told_steps(folder, steps)}: {target}/{pictures[0].name} to {pictures[-1].name}")
+        print(f"{described_steps(folder, steps)}: {target}/{pictures[0].name} to {pictures[-1].name}")
         if len(pictures) > 1 and given.film != "none":
             film = target / f"film.{given.film}"
             write_film(film, pictures, given.fps)

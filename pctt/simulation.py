@@ -29,7 +29,7 @@ from dem import measures
 from dem import record as recording
 from dem.arrays import Floats, frozen
 from dem.bodies import Bodies
-from dem.experiment import Experiment, Given
+from dem.experiment import Experiment, SceneExperiment
 from dem.measures import Sample
 from dem.mesh import Mesh
 from dem.model.changes import change, refuse_functions
@@ -43,7 +43,7 @@ from dem.start.time_step import fall_remark, reason
 from dem.start.turns import TurnWatch
 from dem.step import Step
 from dem.step.impulses import ImpulseMemory
-from dem.together import meet, together
+from dem.together import barrier, together
 from pctt import ccp, log
 from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
@@ -83,7 +83,7 @@ class Simulation:
         settings: Settings | None = None,
         *,
         comm: MPI.Comm = MPI.COMM_WORLD,
-        restart: str | Path | state.Kept = "",
+        restart: str | Path | state.RunState = "",
         compare: ccp.Comparison | None = None,
         say: Callable[[str], object] = print,
         program: bool = False,
@@ -101,7 +101,7 @@ class Simulation:
         if not isinstance(scene, (Scene, Experiment)):
             raise OptionError(f"scene {scene!r}: allowed is a dem.scene.Scene or an instance of an Experiment")
         self.comm = comm
-        self.experiment = scene if isinstance(scene, Experiment) else Given(scene)
+        self.experiment = scene if isinstance(scene, Experiment) else SceneExperiment(scene)
         given = {**(vars(settings) if settings else {}), **changes}
         self._compare = compare or ccp.Comparison(comm, [])
         compared = bool(self._compare.names)
@@ -114,7 +114,7 @@ class Simulation:
         if restart == "settled":
             restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
         self._origin = state.origin(self.experiment, scene, self.settings.dt)
-        if isinstance(restart, state.Kept):
+        if isinstance(restart, state.RunState):
             self.world, self.memory = state.restored(restart, scene, comm)
         elif restart:
             self.world, self.memory = state.load(Path(restart), scene, self._origin, comm, program)
@@ -129,7 +129,7 @@ class Simulation:
         self._turns = TurnWatch()
         self._tell_turns()
         self._begun = restart
-        self.restart = "" if isinstance(restart, state.Kept) else str(restart)  #: the file from which it goes on
+        self.restart = "" if isinstance(restart, state.RunState) else str(restart)  #: the file from which it goes on
         newton = ccp.newton_for(comm, self.settings.solver, self.settings.newton, self._compare)
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
         watch = OverlapWatch(scene, self.settings, float(self.world.pairs.stiffness.min()))
@@ -158,7 +158,7 @@ class Simulation:
 
     def copy(self) -> Simulation:
         """Another simulation in the same state, which goes on with the same bits, and writes no files; collective."""
-        kept = state.kept(self.world, self.memory)
+        kept = state.run_state(self.world, self.memory)
         other = Simulation(self.experiment, self.settings, comm=self.comm, restart=kept, compare=self._compare)
         other.last, other.figures = self.last, dict(self.figures)
         return other
@@ -179,7 +179,7 @@ class Simulation:
         """For pickle: what `copy` takes, of a simulation of one rank; it wakes up on one rank, too."""
         if self.comm.size > 1:
             raise TypeError(f"pickle of a simulation on {self.comm.size} ranks: allowed are one rank, or save and load")
-        return _revived, (self.experiment, self.settings, state.kept(self.world, self.memory))
+        return _revived, (self.experiment, self.settings, state.run_state(self.world, self.memory))
 
     def __enter__(self) -> Simulation:
         return self
@@ -338,7 +338,7 @@ class Simulation:
 
     def _gathered(self, what: str, **columns: np.ndarray) -> dict[str, np.ndarray]:
         """The rows of all ranks, on every rank."""
-        meet(self.comm, f"{what} of a Simulation")
+        barrier(self.comm, f"{what} of a Simulation")
         parts = self.comm.allgather(columns)
         return {name: np.concatenate([part[name] for part in parts]) for name in columns}
 
@@ -347,7 +347,7 @@ class Simulation:
         """Of all bodies that forces move [J]."""
         tables = [self.world.grains] + [self.world.large] * (self.comm.rank == 0)
         energy = sum(recording.energy(table, self.world.gravity)[0] for table in tables)
-        return meet(self.comm, "kinetic_energy of a Simulation", number=energy)
+        return barrier(self.comm, "kinetic_energy of a Simulation", number=energy)
 
     @property
     def contacts(self) -> Contacts:

@@ -50,6 +50,29 @@ def test_no_module_imports_itself_in_a_circle(graph):
     assert order.index("dem.model.world") < order.index("dem.contact") < order.index("dem.start")
 
 
+def at_import(tree):
+    """The names that a file imports when it runs: none for type checkers."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        yield from at_import(node)
+
+
+@pytest.mark.parametrize(("package", "most"), [("dem", 15), ("pctt", 20), ("", 27)])
+def test_a_chain_of_imports_is_no_longer_than_it_was(package, most):
+    known = {name: path for name, path in modules().items() if within(name, package or name)}
+    trees = {name: ast.parse(path.read_text()) for name, path in known.items()}
+    graph = {name: {longest_known(n, known) for n in at_import(tree)} - {None, name} for name, tree in trees.items()}
+    floors = {}
+    for name in TopologicalSorter(graph).static_order():
+        floors[name] = 1 + max((floors[other] for other in graph[name]), default=0)
+    assert max(floors.values()) <= most, max(floors, key=floors.get)
+
+
 #: The packages of dem, each above those before it; what lies flat in dem is below them or a door to them.
 PACKAGES = (
     "geometry", "contact_map", "shapes", "measures", "parts", "model", "unconstrained", "contact", "start", "step",

@@ -60,7 +60,7 @@ SMALL = [
     "--small dt=.005,tol=1e-3", "profile_problems tests/ccp/hard apgd conic --seconds 2 --laws convex",
     "cluster_model 2 -sizes 1,2 -copies 2,1,1", "cluster_start 12 -ranks 4 -of 0,3 -real 8 -steps 1",
     "validate closed_forms", "seeds 1,2 -scene plane_shear -seconds 0.02", "h_stop 2 --rate 40",
-    "features loads --steps 1 --rounds 1", "shapes -n 3 -steps 5 -shapes spheres,cubes",
+    "features loads --side 4 --steps 1 --rounds 1", "shapes -n 3 -steps 5 -shapes spheres,cubes",
     "torture plant cell -n 2 -kills 3 -steps 20", "structure run", "sparse -names pbjacobi",
     "random_scenes 0 3 --steps 3 --processes 1", "drawn_kernels 0 2", "ranks functions",
     "kernels -only imq1 -ways auto plain", "table_plots", "pictures incline -n 2",

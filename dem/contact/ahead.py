@@ -158,9 +158,7 @@ def turn_ahead(
             inside = after_turn(plus(own, -1.0, arc), u, -h)
         if h == 0.0 or dot(n, n) == 0.0:
             continue
-        below = after_turn(plus(their, -1.0, bow), w, -h)
-        if kind[b] == SPHERE:
-            below = plus(center[b], -1.0, place[B])
+        below = plus(center[b], -1.0, place[B]) if kind[b] == SPHERE else after_turn(plus(their, -1.0, bow), w, -h)
         if moves[A]:
             own = plus(inside, 1.0, first_arc)
             if flat:

@@ -59,12 +59,10 @@ def pairs_in_cells(center: Floats, radius: Floats, first: Ints, second: Ints, al
         place[to, 0], place[to, 1], place[to, 2] = center[second[k], 0], center[second[k], 1], center[second[k], 2]
 
     # Alike, the rows are taken in the order of their cells, each with those behind it: every pair comes once.
-    rows = member if alike else first
+    rows, cells = member if alike else first, (largest, per, side, start, place, member)
     pairs, found, done = np.empty((8 * len(first) + 8, 2), np.int64), 0, 0
     while True:
-        done, found = _pairs_of_rows(
-            center, radius, rows, done, alike, largest, per, side, start, place, member, pairs, found
-        )
+        done, found = _pairs_of_rows((center, radius), rows, done, alike, cells, pairs, found)
         if done == len(rows):
             return pairs[:found].copy()
         more = np.empty((len(pairs) + max(len(pairs), len(second)), 2), np.int64)
@@ -73,9 +71,10 @@ def pairs_in_cells(center: Floats, radius: Floats, first: Ints, second: Ints, al
 
 
 @loop
-def _pairs_of_rows(center, radius, rows, done, alike, largest, per, side, start, place, member, pairs, found):
+def _pairs_of_rows(spheres, rows, done, alike, cells, pairs, found):
     """Add to the first pairs those of the rows that are not done, as long as there is room; new numbers of rows done
     and pairs found. A loop that makes the room itself takes twice the time."""
+    (center, radius), (largest, per, side, start, place, member) = spheres, cells
     last = side - 1
     for n in range(done, len(rows)):
         i, behind, before = rows[n], n + 1 if alike else 0, found

@@ -22,8 +22,9 @@ from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, half_thickness
 from dem.compiled import inlined, loop
 from dem.contact.ahead import Forms, Moving, Poses, Touching, after_turn, ahead_by, guest_is_second, spun, vector_of
-from dem.contact.narrow import DISTINCT, Manifold, Planes
-from dem.contact.polyhedra import CLOSE, ROUND, SNAP, Found, Hulls, nearer
+from dem.contact.narrow import DISTINCT, ContactBuffer, Manifold, Planes
+from dem.contact.polyhedra import Hulls
+from dem.contact.simplex import CLOSE, ROUND, SNAP, nearer, no_simplex
 from dem.contact.spheres import frame_of
 from dem.geometry.vectors import dot, plus
 from dem.shapes import CONVEX_SHAPES
@@ -77,12 +78,41 @@ class Solids(NamedTuple):
 
     center: Floats  #: (m, 3) [m]
     turn: Floats  #: (m, 3, 3) from their frames to the world
+    scale: Floats  #: (m,) of the numbers
+    thick: Floats  #: (m,) half thickness [m]
     what: Ints  #: (m,)
     numbers: Floats  #: (m, 6) of a ball radius and 0, of a capsule radius and half length, of a box half extents
     hull: Ints  #: (m,) rows of `hulls`
-    scale: Floats  #: (m,) of the numbers
     rounding: Floats  #: (m,) [m]
-    thick: Floats  #: (m,) half thickness [m]
+
+    def tables(self) -> tuple[tuple[Floats, Floats, Floats, Floats], tuple[Ints, Floats, Ints, Floats]]:
+        """Where they are and what they are, as loops take them."""
+        return self[:4], self[4:]
+
+
+class Shape(NamedTuple):
+    """One of the solids, within loops."""
+
+    what: int
+    numbers: Floats  #: (6,)
+    turn: Floats  #: (3, 3)
+    scale: float
+    vertex: Floats  #: (v, 3) of its hull, as `dem.contact.polyhedra.Hulls` has it
+    inset: Floats  #: (v, 3)
+    normal: Floats  #: (f, 3)
+    corner: Ints  #: (f, s)
+
+
+class Flush(NamedTuple):
+    """What of both shapes of a pair lies flush along the normal, within loops."""
+
+    point: Floats  #: (2, POINTS, 3) in the frame of the normal
+    name: Ints  #: (2, POINTS)
+    flat: Floats  #: (2, POINTS, 2) the points across the normal
+    slope: Floats  #: (2, 3) height and gradients of the plane or line through them
+    many: Ints  #: (2,) numbers of the points
+    sense: Floats  #: (2,) in which they turn
+    bend: Floats  #: (2,) the radius across it where it is a line
 
 
 def solids(kind: Ints, center: Floats, turn: Floats, size: Floats, hulls: Hulls, supports: Supports) -> Solids:
@@ -99,15 +129,15 @@ def solids(kind: Ints, center: Floats, turn: Floats, size: Floats, hulls: Hulls,
     scale[other] = size[other, 0] / supports.radius[form]
     rounding[other] = supports.rounding[form] * scale[other]
     center, turn = np.ascontiguousarray(center), np.ascontiguousarray(turn)
-    return Solids(center, turn, what, numbers, hull, scale, rounding, thick)
+    return Solids(center, turn, scale, thick, what, numbers, hull, rounding)
 
 
 def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) -> Manifold:
     """Contacts of gap at most `delta` (m,) [m], all with the same normal."""
     done, found, room = 0, 0, 4 * len(delta) + POINTS
-    contacts = Found.of(room)
+    given, contacts = (*first.tables(), *second.tables(), *_tables(hulls), delta), ContactBuffer.of(room)
     while True:
-        done, found = _pairs(first, second, hulls, delta, done, found, contacts[:])
+        done, found = _pairs(*given, (done, found), contacts[:])
         if done == len(delta):
             return contacts.manifold(found)
         contacts = contacts.doubled()
@@ -115,8 +145,14 @@ def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) ->
 
 def solids_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> Manifold:
     """What of the body lies flush along the plane: the points of a face or a side, and the support."""
-    contacts, (outward, origin) = Found.of(len(delta) * POINTS), map(np.ascontiguousarray, plane)
-    return contacts.manifold(_planes(body, hulls, outward, origin, delta, contacts[:]))
+    contacts, (outward, origin) = ContactBuffer.of(len(delta) * POINTS), map(np.ascontiguousarray, plane)
+    given = *body.tables(), *_tables(hulls), (outward, origin), delta
+    return contacts.manifold(_planes(*given, contacts[:]))
+
+
+def _tables(hulls: Hulls) -> tuple[tuple[Ints, Floats, Floats], tuple[Floats, Ints]]:
+    """Those of hulls that loops take."""
+    return (hulls.counts, hulls.vertex, hulls.inset), (hulls.normal, hulls.corner)
 
 
 def _chain(functions: Sequence[Any]) -> Any:
@@ -144,10 +180,20 @@ _other_rolls = _chain([shape.rolls for shape in CONVEX_SHAPES])
 _other_arc = _chain([shape.arc for shape in CONVEX_SHAPES])
 
 
+@inlined
+def _shape(place, form, vertices, faces, m):
+    """The solid of a row."""
+    (_, turn, scale, _), (what, numbers, hull, _), (counts, vertex, inset) = place, form, vertices
+    h, (normal, corner) = hull[m], faces
+    v, f = counts[h, 0], counts[h, 1]
+    own = vertex[h, :v], inset[h, :v], normal[h, :f], corner[h, :f]
+    return Shape(what[m], numbers[m], turn[m], scale[m], own[0], own[1], own[2], own[3])
+
+
 @loop
-def _support(solid, hulls, m, skin, x, y, z):
+def _support(shape, skin, x, y, z):
     """The point of a shape without its skin that is furthest along a vector, both in its frame; in its scale."""
-    what, numbers = solid.what[m], solid.numbers[m]
+    what, numbers = shape.what, shape.numbers
     if what == ROD:
         per = (numbers[0] - skin) / np.sqrt(x * x + y * y + z * z)
         found = per * x, per * y, per * z + np.copysign(numbers[1], z)
@@ -156,9 +202,9 @@ def _support(solid, hulls, m, skin, x, y, z):
             np.copysign(numbers[0] - skin, x), np.copysign(numbers[1] - skin, y), np.copysign(numbers[2] - skin, z)
         )  # fmt: skip
     elif what == HULL:
-        h, best, found = solid.hull[m], -np.inf, (0.0, 0.0, 0.0)
-        for k in range(hulls.counts[h, 0]):
-            corner = plus(vector_of(hulls.vertex[h, k], 0), skin, hulls.inset[h, k])
+        best, found = -np.inf, (0.0, 0.0, 0.0)
+        for k in range(len(shape.vertex)):
+            corner = plus(vector_of(shape.vertex[k], 0), skin, shape.inset[k])
             ahead = dot(corner, (x, y, z))
             if ahead > best:
                 best, found = ahead, corner
@@ -187,27 +233,28 @@ def _outward(turn, v):
 
 
 @loop
-def _furthest(solid, hulls, m, skin, shrunk, x, y, z):
+def _furthest(shape, skin, shrunk, x, y, z):
     """The same in the world, from the centre of the shape; `skin` in metres."""
-    x, y, z = _inward(solid.turn[m], (x, y, z))
-    x, y, z = _support(solid, hulls, m, skin / solid.scale[m], x, y, z)
-    x, y, z = _outward(solid.turn[m], (x, y, z))
-    per = shrunk * solid.scale[m]
+    x, y, z = _inward(shape.turn, (x, y, z))
+    x, y, z = _support(shape, skin / shape.scale, x, y, z)
+    x, y, z = _outward(shape.turn, (x, y, z))
+    per = shrunk * shape.scale
     return per * x, per * y, per * z
 
 
 @loop
-def _closest(first, second, hulls, m, skin, other_skin, shrunk, apart, reach, points, way, ends, share, parts):
+def _closest(first, second, skins, shrunk, apart, reach, points, simplex):
     """How many points of the difference of two cores span what is nearest to the origin, and the vector from the first
     to the second there; zero points if they are further apart than the reach, -1 if they overlap. `apart` is the second
     centre from the first. Fills in the points of both (64, 2, 3), their rows and their shares."""
     x, y, z = apart
+    (skin, other_skin), (point, ends, _, _) = skins, simplex
     if x == 0.0 and y == 0.0 and z == 0.0:
         return -1, (0.0, 0.0, 1.0)
     size, count, square, ahead = np.sqrt(dot(apart, apart)), 0, np.inf, 0.0
     for k in range(len(points)):
-        a = _furthest(first, hulls, m, skin, shrunk, x, y, z)
-        b = plus(apart, 1.0, _furthest(second, hulls, m, other_skin, shrunk, -x, -y, -z))
+        a = _furthest(first, skin, shrunk, x, y, z)
+        b = plus(apart, 1.0, _furthest(second, other_skin, shrunk, -x, -y, -z))
         between = plus(b, -1.0, a)
         ahead = dot(between, (x, y, z))
         if ahead > reach * np.sqrt(x * x + y * y + z * z):
@@ -215,9 +262,9 @@ def _closest(first, second, hulls, m, skin, other_skin, shrunk, apart, reach, po
         if count > 0 and square - ahead <= 1e-15 * square + 4e-16 * size * np.sqrt(square):
             break
         for n in range(3):
-            points[k, 0, n], points[k, 1, n], way[count, n] = a[n], b[n], between[n]
+            points[k, 0, n], points[k, 1, n], point[count, n] = a[n], b[n], between[n]
         ends[count, 0] = k
-        many, better, u, v, w = nearer(count, square, way, ends, share, parts)
+        many, better, u, v, w = nearer(count, square, simplex)
         if not better < square:
             break
         count, square, x, y, z = many, better, u, v, w
@@ -228,9 +275,9 @@ def _closest(first, second, hulls, m, skin, other_skin, shrunk, apart, reach, po
 
 
 @loop
-def _face(solid, hulls, m, x, y, z, point, name):
+def _face(shape, x, y, z, point, name):
     """As `dem.shapes.convex` says, of any shape, in its scale."""
-    what, numbers = solid.what[m], solid.numbers[m]
+    what, numbers = shape.what, shape.numbers
     size = np.sqrt(x * x + y * y + z * z)
     count, bend = 1, 0.0
     if what == ROD:
@@ -259,17 +306,17 @@ def _face(solid, hulls, m, x, y, z, point, name):
                 point[k, one], point[k, two] = numbers[one] * (2 * (k in (1, 2)) - 1), numbers[two] * (2 * (k > 1) - 1)
             name[k] = (point[k, 0] > 0.0) + 2 * (point[k, 1] > 0.0) + 4 * (point[k, 2] > 0.0)
     elif what == HULL:
-        h, best, face = solid.hull[m], FLUSH * size, -1
-        for f in range(hulls.counts[h, 1]):
-            ahead = dot(hulls.normal[h, f], (x, y, z))
+        best, face, corner = FLUSH * size, -1, shape.corner
+        for f in range(len(shape.normal)):
+            ahead = dot(shape.normal[f], (x, y, z))
             if ahead > best:
                 best, face = ahead, f
         if face >= 0:
             count = 0
-            while count < hulls.corner.shape[2] and hulls.corner[h, face, count] >= 0:
-                name[count] = hulls.corner[h, face, count]
+            while count < corner.shape[1] and corner[face, count] >= 0:
+                name[count] = corner[face, count]
                 for n in range(3):
-                    point[count, n] = hulls.vertex[h, name[count], n]
+                    point[count, n] = shape.vertex[name[count], n]
                 count += 1
     else:
         count, bend = _other_face(what - OTHER, numbers, x, y, z, point, name)
@@ -277,18 +324,19 @@ def _face(solid, hulls, m, x, y, z, point, name):
 
 
 @loop
-def _laid(solid, hulls, m, frame, sign, apart, point, name, flat, slope):
-    """Fill in what lies flush along a normal, `sign` times the third axis of the frame: points (k, 2) across it, and
-    the plane or line through them: height, and gradients. Returns k, the radius across it where it is a line, and the
-    sense in which the points turn."""
-    n = frame[2]
-    x, y, z = _inward(solid.turn[m], (sign * n[0], sign * n[1], sign * n[2]))
-    count, bend = _face(solid, hulls, m, x, y, z, point, name)
+def _laid(shape, side, apart, frame, flush):
+    """Fill in what of a shape lies flush along a normal, the third axis of the frame, of the second (`side` 1) against
+    it; how many points."""
+    sign, n = 1.0 - 2.0 * side, frame[2]
+    point, name, flat, slope = flush.point[side], flush.name[side], flush.flat[side], flush.slope[side]
+    x, y, z = _inward(shape.turn, (sign * n[0], sign * n[1], sign * n[2]))
+    count, bend = _face(shape, x, y, z, point, name)
+    flush.many[side] = count
     if count < 2:
-        return count, 0.0, 1.0
+        return count
     middle = np.zeros(3)
     for k in range(count):
-        place = plus(apart, solid.scale[m], _outward(solid.turn[m], point[k]))
+        place = plus(apart, shape.scale, _outward(shape.turn, point[k]))
         for i in range(3):
             point[k, i] = dot(frame[i], place)
             middle[i] += point[k, i] / count
@@ -306,7 +354,8 @@ def _laid(solid, hulls, m, frame, sign, apart, point, name, flat, slope):
     else:
         slope[1], slope[2] = -a / c, -b / c
     slope[0] = middle[2] - slope[1] * middle[0] - slope[2] * middle[1]
-    return count, bend * solid.scale[m], np.copysign(1.0, c)
+    flush.bend[side], flush.sense[side] = bend * shape.scale, np.copysign(1.0, c)
+    return count
 
 
 @inlined
@@ -334,9 +383,9 @@ def _within(flat, count, sense, a, b, c, d, slack):
 
 
 @inlined
-def _put(x, y, slope, other_slope, more, reach, what, frame, found, feature, out):
+def _put(x, y, slope, more, reach, what, frame, found, contacts):
     """Add a contact at x, y if its gap is within reach; the number of contacts, and the gap."""
-    low, high = _height(slope, x, y), _height(other_slope, x, y)
+    low, high, (_, feature, out) = _height(slope[0], x, y), _height(slope[1], x, y), contacts
     gap = high - low + more
     if gap <= reach:
         for n in range(3):
@@ -348,9 +397,10 @@ def _put(x, y, slope, other_slope, more, reach, what, frame, found, feature, out
 
 
 @loop
-def _overlaid(flat, name, count, sense, bend, slopes, frame, slack, reach, found, feature, out):
+def _overlaid(flush, frame, slack, reach, found, contacts):
     """Add the corners of what two faces share; the number of contacts, and the least gap."""
-    least, slope, other = np.inf, slopes[0], slopes[1]
+    _, name, flat, slope, count, sense, bend = flush
+    least = np.inf
     if count[0] == 2 and count[1] == 2:
         a, b = flat[0, 0, 0], flat[0, 0, 1]
         u, v = flat[0, 1, 0] - a, flat[0, 1, 1] - b
@@ -369,9 +419,8 @@ def _overlaid(flat, name, count, sense, bend, slopes, frame, slack, reach, found
             x, y = a + t * u, b + t * v
             x, y = flat[1, 0, 0] + s * p - x, flat[1, 0, 1] + s * q - y  # across, to the other line
             more, per = 0.5 * (x * x + y * y) / (bend[0] + bend[1]), bend[0] / (bend[0] + bend[1])
-            found, gap = _put(
-                a + t * u + per * x, b + t * v + per * y, slope, other, more, reach, k, frame, found, feature, out
-            )  # fmt: skip
+            x, y = a + t * u + per * x, b + t * v + per * y
+            found, gap = _put(x, y, slope, more, reach, k, frame, found, contacts)
             least = min(least, gap)
         return found, least
     for one in range(2):
@@ -393,18 +442,15 @@ def _overlaid(flat, name, count, sense, bend, slopes, frame, slack, reach, found
                 what = CROSSING + 2 * (name[one, k] % 32) + last
                 what = first + name[one, k] if low == t == 0.0 else what
                 what = first + name[one, i] if last and high == 1.0 else what
-                found, gap = _put(
-                    a + t * (c - a), b + t * (d - b), slope, other, 0.0, reach, what, frame, found, feature, out
-                )  # fmt: skip
+                x, y = a + t * (c - a), b + t * (d - b)
+                found, gap = _put(x, y, slope, 0.0, reach, what, frame, found, contacts)
                 least = min(least, gap)
     if count[0] > 2 and count[1] > 2:
         for k in range(count[1]):
             x, y = flat[1, k, 0], flat[1, k, 1]
             low, high = _within(flat[0], count[0], sense[0], x, y, x, y, -slack)
             if low <= high:
-                found, gap = _put(
-                    x, y, slope, other, 0.0, reach, SECOND + name[1, k], frame, found, feature, out
-                )  # fmt: skip
+                found, gap = _put(x, y, slope, 0.0, reach, SECOND + name[1, k], frame, found, contacts)
                 least = min(least, gap)
     return found, least
 
@@ -424,57 +470,49 @@ def _across(frame):
 
 
 @loop
-def _pairs(first, second, hulls, delta, done, found, contacts):
+def _pairs(first, form, second, other_form, vertices, faces, delta, progress, contacts):
     """Add to the first contacts those of the pairs that are not done, as long as there is room; new numbers of pairs
     done and contacts found."""
-    pair, feature, out = contacts
-    points, way, ends = np.empty((64, 2, 3)), np.empty((4, 3)), np.empty((4, 2), np.int64)
-    share, parts, frame = np.empty(4), np.empty(6), np.empty((3, 3))
-    point, name, flat = np.empty((2, POINTS, 3)), np.empty((2, POINTS), np.int64), np.empty((2, POINTS, 2))
-    slopes, count, sense, bend = np.zeros((2, 3)), np.empty(2, np.int64), np.empty(2), np.empty(2)
-    origin = 0.0, 0.0, 0.0
+    (center, _, _, thick), (other_center, _, _, other_thick), (done, found) = first, second, progress
+    rounding, other_rounding, (pair, feature, out) = form[3], other_form[3], contacts
+    points, frame, simplex = np.empty((64, 2, 3)), np.empty((3, 3)), no_simplex()
+    flush = Flush(
+        np.empty((2, POINTS, 3)), np.empty((2, POINTS), np.int64), np.empty((2, POINTS, 2)), np.zeros((2, 3)),
+        np.empty(2, np.int64), np.empty(2), np.empty(2),
+    )  # fmt: skip
+    share, ends, origin = simplex.share, simplex.ends, (0.0, 0.0, 0.0)
     for m in range(done, len(delta)):
         if found + POINTS > len(out):
             return m, found
-        thin = min(first.thick[m], second.thick[m])
-        apart = plus(vector_of(second.center[m], 0), -1.0, first.center[m])
-        skin, other_skin = first.rounding[m], second.rounding[m]
+        one, two = _shape(first, form, vertices, faces, m), _shape(second, other_form, vertices, faces, m)
+        thin = min(thick[m], other_thick[m])
+        apart = plus(vector_of(other_center[m], 0), -1.0, center[m])
+        skin, other_skin = rounding[m], other_rounding[m]
         if skin + other_skin <= ROUND * thin:
             skin = max(skin, ROUND * thin) if skin == 0.0 else skin
             other_skin = max(other_skin, ROUND * thin) if other_skin == 0.0 else other_skin
         reach = delta[m] + skin + other_skin
-        many, v = _closest(
-            first, second, hulls, m, skin, other_skin, 1.0, apart, reach, points, way, ends, share, parts
-        )
+        many, v = _closest(one, two, (skin, other_skin), 1.0, apart, reach, points, simplex)
         if many == 0:
             continue
         shrinks = 0
         while many < 0 and shrinks < len(SHRUNK):
-            many, v = _closest(
-                first, second, hulls, m, 0.0, 0.0, SHRUNK[shrinks], apart, np.inf, points, way, ends, share, parts
-            )
+            many, v = _closest(one, two, (0.0, 0.0), SHRUNK[shrinks], apart, np.inf, points, simplex)
             shrinks += 1
         if many < 0:
             v = apart if dot(apart, apart) > 0.0 else (0.0, 0.0, 1.0)
         per = 1.0 / np.sqrt(dot(v, v))
         x, y, z = per * v[0], per * v[1], per * v[2]
-        own = _furthest(first, hulls, m, 0.0, 1.0, x, y, z)
-        their = plus(apart, 1.0, _furthest(second, hulls, m, 0.0, 1.0, -x, -y, -z))
+        own = _furthest(one, 0.0, 1.0, x, y, z)
+        their = plus(apart, 1.0, _furthest(two, 0.0, 1.0, -x, -y, -z))
         gap = dot(plus(their, -1.0, own), (x, y, z))
         if gap > delta[m]:
             continue
         frame[2, 0], frame[2, 1], frame[2, 2] = x, y, z
         _across(frame)
         start, least = found, np.inf
-        count[0], bend[0], sense[0] = _laid(first, hulls, m, frame, 1.0, origin, point[0], name[0], flat[0], slopes[0])
-        if count[0] > 1:
-            count[1], bend[1], sense[1] = _laid(
-                second, hulls, m, frame, -1.0, apart, point[1], name[1], flat[1], slopes[1]
-            )
-            if count[1] > 1:
-                found, least = _overlaid(
-                    flat, name, count, sense, bend, slopes, frame, SNAP * thin, delta[m], found, feature, out
-                )  # fmt: skip
+        if _laid(one, 0, origin, frame, flush) > 1 and _laid(two, 1, apart, frame, flush) > 1:
+            found, least = _overlaid(flush, frame, SNAP * thin, delta[m], found, contacts)
         if gap < least - DISTINCT * thin:
             middle, height = plus(own, 0.5 * gap, frame[2]), dot(own, frame[2]) + 0.5 * gap
             for k in range(many):  # of the cores; the supports of flat ones may be anywhere on them
@@ -489,31 +527,31 @@ def _pairs(first, second, hulls, delta, done, found, contacts):
         for k in range(start, found):
             pair[k] = m
             for n in range(3):
-                out[k, n] += first.center[m, n]
+                out[k, n] += center[m, n]
     return len(delta), found
 
 
 @loop
-def _planes(body, hulls, outward, origin, delta, contacts):
+def _planes(body, form, vertices, faces, plane, delta, contacts):
     """Fill in the contacts of shapes with half spaces; their number."""
-    pair, feature, out = contacts
+    (center, _, _, thick), (outward, origin), (pair, feature, out) = body, plane, contacts
     point, name, found = np.empty((POINTS, 3)), np.empty(POINTS, np.int64), 0
     for m in range(len(delta)):
-        normal = vector_of(outward[m], 0)
-        x, y, z = _inward(body.turn[m], (-normal[0], -normal[1], -normal[2]))
-        count, _ = _face(body, hulls, m, x, y, z, point, name)
+        normal, shape = vector_of(outward[m], 0), _shape(body, form, vertices, faces, m)
+        x, y, z = _inward(shape.turn, (-normal[0], -normal[1], -normal[2]))
+        count, _ = _face(shape, x, y, z, point, name)
         # The support, unless it is among them, as of a face with edges.
-        point[count, 0], point[count, 1], point[count, 2] = _support(body, hulls, m, 0.0, x, y, z)
+        point[count, 0], point[count, 1], point[count, 2] = _support(shape, 0.0, x, y, z)
         name[count], least = CLOSEST, -np.inf
         for k in range(count if count > 1 else 0):
             least = max(least, dot(point[k], (x, y, z)))
         if count == 1:
             for n in range(3):
                 point[0, n], name[0] = point[1, n], CLOSEST
-        elif dot(point[count], (x, y, z)) > least + DISTINCT * body.thick[m] / body.scale[m]:
+        elif dot(point[count], (x, y, z)) > least + DISTINCT * thick[m] / shape.scale:
             count += 1
         for k in range(count):
-            place = plus(vector_of(body.center[m], 0), body.scale[m], _outward(body.turn[m], point[k]))
+            place = plus(vector_of(center[m], 0), shape.scale, _outward(shape.turn, point[k]))
             gap = dot(plus(place, -1.0, origin[m]), normal)
             if gap <= delta[m]:
                 place = plus(place, -0.5 * gap, normal)

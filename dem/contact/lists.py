@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from operator import attrgetter, is_
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,8 +22,10 @@ from dem.contact_map import Halo
 from dem.exchange import on_any
 from dem.model.images import Images, images
 from dem.model.neighbourhood import Neighbourhood, neighbourhood
-from dem.model.world import World
 from dem.parts.cell import Cell
+
+if TYPE_CHECKING:
+    from dem.model.world import World
 
 #: The slack of a grain at rest, as a part of its radius. In a mixer lists of 0.2 and 8 have a fifth more pairs than
 #: those of 0.1 and 4, and are made half as often: a search takes 5 % less.
@@ -57,7 +59,7 @@ class Lists:
 
     def hold(self, world: World, margin: Floats) -> bool:
         """Whether the lists of this rank have all pairs of these margins (grains,)."""
-        margin = margin + world.cell.gone_since(self.cell)
+        margin = margin + world.cell.image_travel(self.cell)
         same = all(map(is_, self.constant, _constant(world)))
         return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
 

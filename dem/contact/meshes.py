@@ -45,7 +45,7 @@ class PlacedMesh(NamedTuple):
     turn: Floats  #: (3, 3) its frame
 
 
-class _Found(NamedTuple):
+class _SurfaceContacts(NamedTuple):
     """Contacts of bodies and one surface, in its frame."""
 
     row: Ints  #: (k,) of the body
@@ -54,9 +54,9 @@ class _Found(NamedTuple):
     away: Floats  #: (k, 3) unit vector from there to the body
     gap: Floats  #: (k,) [m]
 
-    def take(self, rows: Ints | Bools) -> _Found:
+    def take(self, rows: Ints | Bools) -> _SurfaceContacts:
         columns: Any = self
-        return _Found(*(column[rows] for column in columns))
+        return _SurfaceContacts(*(column[rows] for column in columns))
 
     def manifold(self, mesh: PlacedMesh) -> Manifold:
         """The same in the world."""
@@ -88,7 +88,7 @@ def capsule_mesh(capsule: Capsules, mesh: PlacedMesh, delta: Floats) -> Manifold
     row, triangle = surface.near(core.center, core.half_length + reach)
     through = _through_faces(row, triangle, core, surface)
     parts += [_across_edges(row, triangle, core, reach, surface), _over_vertices(row, triangle, core, reach, surface)]
-    found = _Found(*(np.concatenate(columns) for columns in zip(*parts, through)))
+    found = _SurfaceContacts(*(np.concatenate(columns) for columns in zip(*parts, through)))
     # The end on the wrong side of a face that the core goes through would be held there; the first is at the start.
     short = (dot(through.away, core.axis[through.row]) < 0.0).astype(np.int64)
     stuck = PARTS * surface.features * through.row + through.feature + (short - 2) * surface.features
@@ -103,7 +103,7 @@ def plane_mesh(plane: Planes, mesh: PlacedMesh, delta: Floats) -> Manifold:
     return Manifold(pair, hull[corner], reversed_touch(touch))
 
 
-def _feet(ball: Spheres, delta: Floats, surface: Surface) -> _Found:
+def _feet(ball: Spheres, delta: Floats, surface: Surface) -> _SurfaceContacts:
     """The places of the surface at distances from the centres of balls (m,) that are least around them, with gaps of
     at most `delta` (m,)."""
     center, radius = ball
@@ -120,7 +120,7 @@ def _feet(ball: Spheres, delta: Floats, surface: Surface) -> _Found:
     least, away = first[within], away[within]
     chosen = _one_for_each(row, triangle, found, least, radius, surface)
     row, gap = row[least], found.distance[least] - radius[row[least]]
-    return _Found(row, found.feature[least], found.point[least], away, gap).take(chosen)
+    return _SurfaceContacts(row, found.feature[least], found.point[least], away, gap).take(chosen)
 
 
 def _within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, slack: float) -> Bools:
@@ -173,7 +173,7 @@ def _each_once(row: Ints, items: Ints, wanted: Bools) -> tuple[Ints, Ints]:
     return np.divmod(np.unique((row[:, None] * len(wanted) + items)[wanted[items]]), len(wanted))  # type: ignore
 
 
-def _across_edges(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> _Found:
+def _across_edges(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> _SurfaceContacts:
     """Where cores pass over edges, each between its ends."""
     center, axis, half_length, radius = core
     row, edge = _each_once(row, surface.side[triangle], surface.ridges)
@@ -186,7 +186,7 @@ def _across_edges(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surf
     return _from_core(row[over], feature, point, s[over], ROCKING, core, reach, surface)
 
 
-def _over_vertices(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> _Found:
+def _over_vertices(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> _SurfaceContacts:
     """Vertices that are beside cores, between their ends."""
     sharp = np.zeros(len(surface.vertex), dtype=bool)
     sharp[surface.edge[surface.ridges]] = True
@@ -200,18 +200,18 @@ def _over_vertices(row: Ints, triangle: Ints, core: Capsules, reach: Floats, sur
 
 def _from_core(
     row: Ints, feature: Ints, point: Floats, s: Floats, slack: float, core: Capsules, reach: Floats, surface: Surface
-) -> _Found:
+) -> _SurfaceContacts:
     """The contacts of points of edges and vertices with the places `s` [m] of the cores, where these are closest."""
     center, axis, _, radius = core
     away = center[row] + s[:, None] * axis[row] - point
     distance = length(away)
     away = away / np.where(distance > 0.0, distance, 1.0)[:, None]
-    found = _Found(row, feature + 2 * surface.features, point, away, distance - radius[row])
+    found = _SurfaceContacts(row, feature + 2 * surface.features, point, away, distance - radius[row])
     near = np.flatnonzero((distance > 0.0) & (distance <= reach[row]))
     return found.take(near[_within_cone(surface, feature[near], point[near], away[near], slack)])
 
 
-def _through_faces(row: Ints, triangle: Ints, core: Capsules, surface: Surface) -> _Found:
+def _through_faces(row: Ints, triangle: Ints, core: Capsules, surface: Surface) -> _SurfaceContacts:
     """Where cores go through faces."""
     center, axis, half_length, radius = core
     normal, corner = surface.normal[triangle], surface.corner[triangle]
@@ -222,4 +222,4 @@ def _through_faces(row: Ints, triangle: Ints, core: Capsules, surface: Surface) 
     in_face = surface.closest(point, triangle).feature == triangle
     gap = np.abs(height) - np.abs(slope) - radius[row]
     away = np.copysign(1.0, height)[:, None] * normal
-    return _Found(row, triangle + 2 * surface.features, point, away, gap).take(in_face)
+    return _SurfaceContacts(row, triangle + 2 * surface.features, point, away, gap).take(in_face)

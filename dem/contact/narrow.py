@@ -78,6 +78,29 @@ class Manifold(NamedTuple):
     touch: Touch  #: (k, ...)
 
 
+class ContactBuffer(NamedTuple):
+    """Room for contacts, which loops fill in."""
+
+    pair: Ints  #: (room,)
+    feature: Ints  #: (room,)
+    out: Floats  #: (room, 7) points, normals and gaps
+
+    @classmethod
+    def of(cls, room: int) -> ContactBuffer:
+        """Room for so many."""
+        return cls(np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7)))
+
+    def doubled(self) -> ContactBuffer:
+        """The same with as much room again."""
+        return ContactBuffer(*(np.concatenate([column, np.empty_like(column)]) for column in self))  # type: ignore[arg-type]
+
+    def manifold(self, found: int) -> Manifold:
+        """The contacts that are filled in."""
+        columns = self.out[:found, :3], self.out[:found, 3:6], self.out[:found, 6]
+        touch = Touch(*(np.ascontiguousarray(column) for column in columns))
+        return Manifold(self.pair[:found], self.feature[:found], touch)
+
+
 def joined(parts: list[Manifold]) -> Manifold:
     """All contacts of several manifolds of the same pairs."""
     pair, feature, touch = zip(*parts)

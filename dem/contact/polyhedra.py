@@ -21,8 +21,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dem.arrays import Floats, Ints
-from dem.compiled import loop
-from dem.contact.narrow import CORNERS, Manifold, Planes, Spheres, Touch
+from dem.compiled import inlined, loop
+from dem.contact.narrow import CORNERS, ContactBuffer, Manifold, Planes, Spheres
+from dem.contact.simplex import CLOSE, ROUND, SNAP, nearer, no_simplex
 from dem.geometry.vectors import dot
 from dem.shapes.forms import Form
 from dem.shapes.polyhedra import Faces, Solid, hull
@@ -31,19 +32,9 @@ from dem.shapes.polyhedra import Faces, Solid, hull
 #: not, in the closest points alone.
 FLUSH = 0.1
 
-#: Corners and edges that are closer to each other across the normal than this share of the lesser half thickness of the
-#: two count as one on top of the other.
-SNAP = 1e-3
-
 #: Lengths that differ by less than this share of the lesser half thickness are equal: what is chosen among equals does
 #: not depend on rounding.
 TIE = 1e-9
-
-#: Radius to which edges and corners that meet count as rounded, as a share of the lesser half thickness.
-ROUND = 0.01
-
-#: Two points that are closer than this share of the lesser half thickness give no direction.
-CLOSE = 1e-7
 
 #: Edges whose angle has a sine below this are parallel and have no normal in common.
 PARALLEL = 1e-5
@@ -117,27 +108,31 @@ class Polyhedra(NamedTuple):
         return center, turn, scale, self.hull
 
 
-class Found(NamedTuple):
-    """Room for contacts, which loops fill in."""
+class Edges(NamedTuple):
+    """A polyhedron in the world by its edges, within loops."""
 
-    pair: Ints  #: (room,)
-    feature: Ints  #: (room,)
-    out: Floats  #: (room, 7) points, normals and gaps
+    counts: Ints  #: (3,) of vertices, faces, edges
+    points: Floats  #: (v, 3) its vertices
+    normals: Floats  #: (f, 3)
+    edge: Ints  #: (e, 2)
+    wing: Ints  #: (e, 2)
 
-    @classmethod
-    def of(cls, room: int) -> Found:
-        """Room for so many."""
-        return cls(np.empty(room, np.int64), np.empty(room, np.int64), np.empty((room, 7)))
 
-    def doubled(self) -> Found:
-        """The same with as much room again."""
-        return Found(*(np.concatenate([column, np.empty_like(column)]) for column in self))  # type: ignore[arg-type]
+class Cored(NamedTuple):
+    """The same with and without its skin."""
 
-    def manifold(self, found: int) -> Manifold:
-        """The contacts that are filled in."""
-        columns = self.out[:found, :3], self.out[:found, 3:6], self.out[:found, 6]
-        touch = Touch(*(np.ascontiguousarray(column) for column in columns))
-        return Manifold(self.pair[:found], self.feature[:found], touch)
+    points: Floats  #: (v, 3)
+    core: Floats  #: (v, 3)
+    edge: Ints  #: (e, 2)
+
+
+class Polygon(NamedTuple):
+    """A face across the axis along which it is seen, within loops."""
+
+    many: int  #: its corners
+    flat: Floats  #: (s, 3) these, the height last
+    beyond: Floats  #: (s, s) how far they are beyond the lines of the other polygon
+    plane: Floats  #: (3,) slopes, and height at the origin
 
 
 def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> Manifold:
@@ -147,7 +142,7 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
     """
     most = 4 * first.hulls.corner.shape[2] + 2 * first.hulls.vertex.shape[1]
     done, found, room = 0, 0, 4 * len(delta) + most
-    given, contacts = (*first.hulls.tables(), first.columns(), second.columns(), delta), Found.of(room)
+    given, contacts = (*first.hulls.tables(), first.columns(), second.columns(), delta), ContactBuffer.of(room)
     while True:
         done, found = _pairs(*given, most, (done, found), contacts[:])
         if done == len(delta):
@@ -157,14 +152,14 @@ def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> M
 
 def spheres_polyhedra(ball: Spheres, body: Polyhedra, delta: Floats) -> Manifold:
     """One contact, at the closest point; a centre inside is pushed out through the nearest face."""
-    contacts, hulls = Found.of(len(delta)), body.hulls
+    contacts, hulls = ContactBuffer.of(len(delta)), body.hulls
     given = ball[:], hulls.tables()[0], hulls.corner, body.columns(), delta
     return contacts.manifold(_spheres(*given, contacts[:]))
 
 
 def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
     """The corners."""
-    contacts = Found.of(len(delta) * body.hulls.vertex.shape[1])
+    contacts = ContactBuffer.of(len(delta) * body.hulls.vertex.shape[1])
     return contacts.manifold(_planes(body.hulls.tables()[0], body.columns(), plane[:], delta, contacts[:]))
 
 
@@ -201,36 +196,37 @@ def _planes(faces, body, plane, delta, contacts):
 
 
 @loop
-def _place(count, vertex, normal, corner, turn, scale, x, y, z, points, normals, level):
-    """Fill in the vertices, the normals and, along these, the levels of the faces of a polyhedron at x, y, z; its half
+def _place(hull, place, turn, scale, points, normals, level):
+    """Fill in the vertices, the normals and, along these, the levels of the faces of a polyhedron at a place; its half
     thickness: how far its faces are from its centre at least."""
+    (count, vertex, normal, corner), (x, y, z) = hull, place
     for k in range(count[0]):
         a, b, c = scale[0] * vertex[k, 0], scale[1] * vertex[k, 1], scale[2] * vertex[k, 2]
         points[k, 0] = x + (turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c)
         points[k, 1] = y + (turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c)
         points[k, 2] = z + (turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c)
     thick = np.inf
-    for f in range(count[1]):
-        a, b, c = normal[f, 0] / scale[0], normal[f, 1] / scale[1], normal[f, 2] / scale[2]
+    for i in range(count[1]):
+        a, b, c = normal[i, 0] / scale[0], normal[i, 1] / scale[1], normal[i, 2] / scale[2]
         per = 1.0 / np.sqrt(a * a + b * b + c * c)
         u = (turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c) * per
         v = (turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c) * per
         w = (turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c) * per
-        k = corner[f, 0]
-        normals[f, 0], normals[f, 1], normals[f, 2] = u, v, w
-        level[f] = u * points[k, 0] + v * points[k, 1] + w * points[k, 2]
-        thick = min(thick, level[f] - (u * x + v * y + w * z))
+        k = corner[i, 0]
+        normals[i, 0], normals[i, 1], normals[i, 2] = u, v, w
+        level[i] = u * points[k, 0] + v * points[k, 1] + w * points[k, 2]
+        thick = min(thick, level[i] - (u * x + v * y + w * z))
     return thick
 
 
 @loop
-def _within(many, points, inset, turn, skin, out):
+def _within(points, inset, turn, skin, core):
     """Fill in where the vertices of a polyhedron are when its faces move in by the depth of its skin."""
-    for k in range(many):
+    for k in range(len(core)):
         for n in range(3):
-            out[k, n] = points[k, n]
+            core[k, n] = points[k, n]
             for i in range(3):
-                out[k, n] += skin * turn[n, i] * inset[k, i]
+                core[k, n] += skin * turn[n, i] * inset[k, i]
 
 
 @loop
@@ -275,20 +271,20 @@ def _slopes(edges, edge, points, faces, normals, out):
 
 
 @loop
-def _crossing(edges, edge, wing, p, p_normal, other_faces, others, other_edge, other_wing, q, q_normal, faces, slopes,
-              tie, axis):  # fmt: skip
+def _crossing(first, second, slopes, tie, axis):
     """The two edges along whose common normal the polyhedra are furthest apart, and how far: two edges whose normals
     cross on the sphere make a face of the difference of the two. Fills in the normal, the axis."""
+    (many, p, p_normal, edge, wing), (others, q, q_normal, other_edge, other_wing) = first, second
     p_slope, q_slope = slopes[0], slopes[1]
-    _slopes(edges, edge, p, other_faces, q_normal, p_slope)
-    _slopes(others, other_edge, q, faces, p_normal, q_slope)
+    _slopes(many[2], edge, p, others[1], q_normal, p_slope)
+    _slopes(others[2], other_edge, q, many[1], p_normal, q_slope)
     best, one, two = -np.inf, -1, -1
-    for e in range(edges):
+    for e in range(many[2]):
         left, right = wing[e, 0], wing[e, 1]
         a, b = edge[e, 0], edge[e, 1]
         x, y, z = p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
         square = x * x + y * y + z * z
-        for d in range(others):
+        for d in range(others[2]):
             s, t = p_slope[e, other_wing[d, 0]], q_slope[d, right]
             if s * p_slope[e, other_wing[d, 1]] < 0.0 and q_slope[d, left] * t < 0.0 and s * t < 0.0:
                 c, k = other_edge[d, 0], other_edge[d, 1]
@@ -327,7 +323,7 @@ def _towards(many, corner, points, normals, axis, sign, slack):
     return face
 
 
-@loop
+@inlined
 def _polygon(corner, points, normal, frame, sign, flat, line, plane):
     """Fill in the corners of a face in a frame (rows of unit vectors): two coordinates, and the height along the third
     axis; the lines of its sides, outward normal and level; and its plane, slopes and height at the origin. The number
@@ -352,17 +348,18 @@ def _polygon(corner, points, normal, frame, sign, flat, line, plane):
     return many
 
 
-@loop
-def _corners(many, flat, beyond, others, other, other_beyond, plane, other_plane, sign, thick, most, spots, code):
+@inlined
+def _corners(polygon, opposite, sign, thick, most, spots, code):
     """Fill in the places, the gaps and the numbers of the corners of a polygon that are over another one, if the gap is
     at most `most`; how many, and the least gap of all. A corner on a corner is one contact, in the middle of the two,
     and one of the first polygon, `sign` 1."""
+    (many, flat, beyond, plane), (others, other, other_beyond, other_plane) = polygon, opposite
     found, least = 0, np.inf
     for k in range(many):
         if not _inside(beyond[k], others, thick):
             continue
         x, y = flat[k, 0], flat[k, 1]
-        own, opposite = flat[k, 2], other_plane[0] * x + other_plane[1] * y + other_plane[2]
+        low, high = flat[k, 2], other_plane[0] * x + other_plane[1] * y + other_plane[2]
         twin = -1
         for n in range(others):
             u, v = other[n, 0] - x, other[n, 1] - y
@@ -373,12 +370,12 @@ def _corners(many, flat, beyond, others, other, other_beyond, plane, other_plane
             if sign < 0.0:
                 continue
             u, v = other[twin, 0], other[twin, 1]
-            own, opposite = 0.5 * (own + plane[0] * u + plane[1] * v + plane[2]), 0.5 * (opposite + other[twin, 2])
+            low, high = 0.5 * (low + plane[0] * u + plane[1] * v + plane[2]), 0.5 * (high + other[twin, 2])
             x, y = 0.5 * (x + u), 0.5 * (y + v)
-        gap = sign * (opposite - own)
+        gap = sign * (high - low)
         least = min(least, gap)
         if gap <= most:
-            spots[found, 0], spots[found, 1], spots[found, 2], spots[found, 3] = x, y, 0.5 * (own + opposite), gap
+            spots[found, 0], spots[found, 1], spots[found, 2], spots[found, 3] = x, y, 0.5 * (low + high), gap
             code[found] = k
             found += 1
     return found, least
@@ -393,10 +390,11 @@ def _inside(beyond, many, thick):
     return inside
 
 
-@loop
-def _crossings(many, flat, beyond, others, other, other_beyond, thick, most, spots, code):
+@inlined
+def _crossings(polygon, opposite, thick, most, spots, code):
     """The same of the crossings of the sides of two polygons, which have the numbers k S + n of two sides, for S in a
     row: the ends of each are on both sides of the other, none of them just on it."""
+    (many, flat, beyond, _), (others, other, other_beyond, _) = polygon, opposite
     found, least = 0, np.inf
     for k in range(many):
         after = k + 1 if k + 1 < many else 0
@@ -412,7 +410,7 @@ def _crossings(many, flat, beyond, others, other, other_beyond, thick, most, spo
             if high - low <= most:
                 spots[found, 0] = flat[k, 0] + i * (flat[after, 0] - flat[k, 0])
                 spots[found, 1] = flat[k, 1] + i * (flat[after, 1] - flat[k, 1])
-                spots[found, 2], spots[found, 3], code[found] = 0.5 * (low + high), high - low, k * len(other) + n
+                spots[found, 2], spots[found, 3], code[found] = 0.5 * (low + high), high - low, k * len(beyond) + n
                 found += 1
     return found, least
 
@@ -430,11 +428,12 @@ def _well_inside(spots, many, corner, line, margin):
 
 
 @loop
-def _overlaid(corners, p, normal, other_corners, q, other_normal, frame, thick, most, flat, line, plane, beyond,
-              spots, code):  # fmt: skip
-    """The corners of the polygon that is common to two faces, seen along the third axis of the frame: how many corners
-    of the first, of the second, and crossings have a gap of at most `most`, and the least gap of all; fills in these
-    and leaves their numbers in `code`."""
+def _overlaid(face, other, frame, thick, most, room, found):
+    """The corners of the polygon that is common to two faces, each given by its corners, the points and its normal, and
+    seen along the third axis of the frame: how many corners of the first, of the second, and crossings have a gap of at
+    most `most`, and the least gap of all; fills in these and leaves their numbers in `code`."""
+    (flat, line, plane, beyond), (spots, code) = room, found
+    (corners, p, normal), (other_corners, q, other_normal) = face, other
     many = _polygon(corners, p, normal, frame, 1.0, flat[0], line[0], plane[0])
     others = _polygon(other_corners, q, other_normal, frame, -1.0, flat[1], line[1], plane[1])
     if many == 0 or others == 0:
@@ -443,61 +442,28 @@ def _overlaid(corners, p, normal, other_corners, q, other_normal, frame, thick, 
         for n in range(others):
             beyond[0, k, n] = line[1, n, 0] * flat[0, k, 0] + line[1, n, 1] * flat[0, k, 1] - line[1, n, 2]
             beyond[1, n, k] = line[0, k, 0] * flat[1, n, 0] + line[0, k, 1] * flat[1, n, 1] - line[0, k, 2]
-    of_first, least = _corners(
-        many, flat[0], beyond[0], others, flat[1], beyond[1], plane[0], plane[1], 1.0, thick, most, spots, code
-    )
-    of_second, lesser = _corners(
-        others, flat[1], beyond[1], many, flat[0], beyond[0], plane[1], plane[0], -1.0, thick, most, spots[of_first:],
-        code[of_first:],
-    )  # fmt: skip
+    polygon = Polygon(many, flat[0], beyond[0], plane[0])
+    opposite = Polygon(others, flat[1], beyond[1], plane[1])
+    of_first, least = _corners(polygon, opposite, 1.0, thick, most, spots, code)
+    of_second, lesser = _corners(opposite, polygon, -1.0, thick, most, spots[of_first:], code[of_first:])
     both = of_first + of_second
-    crossed, lowest = _crossings(
-        many, flat[0], beyond[0], others, flat[1], beyond[1], thick, most, spots[both:], code[both:]
-    )
+    crossed, lowest = _crossings(polygon, opposite, thick, most, spots[both:], code[both:])
     return of_first, of_second, crossed, min(least, min(lesser, lowest))
 
 
 @loop
-def _on_triangle(a, b, c, share):
-    """Fill in the shares of the corners of a triangle in its point nearest to the origin (Ericson 2005, "Real-time
-    collision detection", 5.1.5); its squared distance."""
-    aa, bb, cc, ab, ac, bc = dot(a, a), dot(b, b), dot(c, c), dot(a, b), dot(a, c), dot(b, c)
-    d1, d2, d3, d4, d5, d6 = aa - ab, aa - ac, ab - bb, ab - bc, ac - bc, ac - cc
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    if d1 <= 0.0 and d2 <= 0.0:
-        v, w = 0.0, 0.0
-    elif d3 >= 0.0 and d4 <= d3:
-        v, w = 1.0, 0.0
-    elif d6 >= 0.0 and d5 <= d6:
-        v, w = 0.0, 1.0
-    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        v, w = d1 / (d1 - d3), 0.0
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        v, w = 0.0, d2 / (d2 - d6)
-    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        v = 1.0 - w
-    else:
-        v, w = vb / (va + vb + vc), vc / (va + vb + vc)
-    u = 1.0 - v - w
-    share[0], share[1], share[2] = u, v, w
-    x, y, z = u * a[0] + v * b[0] + w * c[0], u * a[1] + v * b[1] + w * c[1], u * a[2] + v * b[2] + w * c[2]
-    return x * x + y * y + z * z
-
-
-@loop
-def _distance(p, many, q, others, x, y, z, reach, size, way, ends, share, parts):
+def _distance(p, q, apart, reach, size, simplex):
     """How many points of the difference of two polyhedra that do not overlap span what is nearest to the origin, and
     the distance, or that it is more than the reach: zero and inf. Fills in the points, the rows of the vertices of
-    both, and the shares of the points. x, y, z: a way about from the first to the second."""
-    count, square = 0, np.inf
+    both, and the shares of the points. `apart`: a vector from about the first to about the second."""
+    (x, y, z), (point, ends, _, _), count, square = apart, simplex, 0, np.inf
     for _ in range(64):
         least, most, i, j = np.inf, -np.inf, 0, 0
-        for k in range(many):
+        for k in range(len(p)):
             ahead = x * p[k, 0] + y * p[k, 1] + z * p[k, 2]
             if ahead > most:
                 most, i = ahead, k
-        for k in range(others):
+        for k in range(len(q)):
             ahead = x * q[k, 0] + y * q[k, 1] + z * q[k, 2]
             if ahead < least:
                 least, j = ahead, k
@@ -507,47 +473,12 @@ def _distance(p, many, q, others, x, y, z, reach, size, way, ends, share, parts)
             break
         ends[count, 0], ends[count, 1] = i, j
         for n in range(3):
-            way[count, n] = q[j, n] - p[i, n]
-        many_left, better, u, v, w = nearer(count, square, way, ends, share, parts)
+            point[count, n] = q[j, n] - p[i, n]
+        many, better, u, v, w = nearer(count, square, simplex)
         if not better < square:
             break
-        count, square, x, y, z = many_left, better, u, v, w
+        count, square, x, y, z = many, better, u, v, w
     return count, np.sqrt(square)
-
-
-@loop
-def nearer(count, square, way, ends, share, parts):
-    """Make of a simplex of so many points of `way` (4, 3), and of the point that follows them, the part that is nearest
-    to the origin, if it is nearer than `square`: how many points it has, the square of its distance, and its place. The
-    rows `ends` (4, 2) go with the points; their `share` (4,) is filled in."""
-    first, second, better = 0, 0, np.inf  # the new simplex: `first`, `second` and the last of the points
-    if count == 0:
-        better = dot(way[0], way[0])
-        parts[0], parts[1], parts[2] = 0.0, 0.0, 1.0
-    elif count == 1:
-        a, b = dot(way[0], way[0]), dot(way[0], way[1])
-        t = min(max((a - b) / (a - 2.0 * b + dot(way[1], way[1])), 0.0), 1.0)
-        parts[0], parts[1], parts[2], better = 1.0 - t, 0.0, t, 0.0
-        for n in range(3):
-            better += ((1.0 - t) * way[0, n] + t * way[1, n]) ** 2
-    else:
-        for one in range(count - 1):
-            for two in range(one + 1, count):
-                found = _on_triangle(way[one], way[two], way[count], parts[3:])
-                if found < better:
-                    better, first, second = found, one, two
-                    parts[0], parts[1], parts[2] = parts[3], parts[4], parts[5]
-    x, y, z, last = 0.0, 0.0, 0.0, count
-    if better < square:
-        count = 0
-        for n in range(3):
-            k = first if n == 0 else second if n == 1 else last
-            if parts[n] > 0.0:
-                share[count], ends[count, 0], ends[count, 1] = parts[n], ends[k, 0], ends[k, 1]
-                way[count, 0], way[count, 1], way[count, 2] = way[k, 0], way[k, 1], way[k, 2]
-                x, y, z = x + parts[n] * way[k, 0], y + parts[n] * way[k, 1], z + parts[n] * way[k, 2]
-                count += 1
-    return count, better, x, y, z
 
 
 @loop
@@ -592,44 +523,45 @@ def _foot(a, b, point, place):
 
 
 @loop
-def _parts(p, many, q, others, place, distance):
-    """Whether the way between two places, of that length, is one across which polyhedra are apart, and not within
-    both."""
+def _separates(p, q, place, distance):
+    """Whether polyhedra are apart along the vector between two places, of that length, which may be within both."""
     x, y, z = place[1, 0] - place[0, 0], place[1, 1] - place[0, 1], place[1, 2] - place[0, 2]
     most, least = -np.inf, np.inf
-    for k in range(many):
+    for k in range(len(p)):
         most = max(most, x * p[k, 0] + y * p[k, 1] + z * p[k, 2])
-    for k in range(others):
+    for k in range(len(q)):
         least = min(least, x * q[k, 0] + y * q[k, 1] + z * q[k, 2])
     return least - most > 0.5 * distance * distance
 
 
 @loop
-def _edge_of(edges, edge, one, two):
+def _edge_of(edge, one, two):
     """The number of the edge between two vertices, -1 if there is none."""
-    for e in range(edges):
+    for e in range(len(edge)):
         if (edge[e, 0] == one and edge[e, 1] == two) or (edge[e, 0] == two and edge[e, 1] == one):
             return e
     return -1
 
 
 @loop
-def _on_edges(points, many, others, count, edges, edge, axis, sign, slack, most, end, skin, other_skin, first, found,
-              out, feature):  # fmt: skip
+def _on_edges(body, other, axis, sign, limits, first, found, contacts):
     """Add the vertices of a polyhedron, of those that are foremost along the axis (`sign` -1: against it) within the
     slack, that are at most `most` from edges of the other one, which has such vertices too, and not beside their ends
-    by more than `end`; the new number of contacts, and the least distance. Their places are those of the vertices and
-    edges of the polyhedra with their skins. `first` is the number of the first vertex among the features."""
+    by more than `end`; the new number of contacts, and the least distance. Distances are those of the cores, places
+    those of the vertices and edges outside. `limits` are slack, `most` and `end`; `first` is the number of the first
+    vertex among the features."""
+    (slack, most, end), (_, feature, out), skin, other_skin = limits, contacts, body.points, other.points
+    points, others, edge = body.core, other.core, other.edge
     front, back, least = -np.inf, np.inf, np.inf
-    for k in range(many):
+    for k in range(len(points)):
         front = max(front, sign * dot(axis, points[k]))
-    for k in range(count):
+    for k in range(len(others)):
         back = min(back, sign * dot(axis, others[k]))
-    for k in range(many):
+    for k in range(len(points)):
         if sign * dot(axis, points[k]) < front - slack:
             continue
         best, x, y, z, one, two = np.inf, 0.0, 0.0, 0.0, 0, 0
-        for e in range(edges):
+        for e in range(len(edge)):
             a, b = edge[e, 0], edge[e, 1]
             if min(sign * dot(axis, others[a]), sign * dot(axis, others[b])) > back + slack:
                 continue
@@ -678,40 +610,38 @@ def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
     (sharp, count, vertex, normal), (corner, side, edge, wing) = faces, sides
     (center, turn, scale, hull), (other_center, other_turn, other_scale, other_hull) = first, second
     (done, found), (pair, feature, out) = progress, contacts
-    v, f, s, e = vertex.shape[1], normal.shape[1], corner.shape[2], edge.shape[1]
-    points, normals, level = np.empty((2, v, 3)), np.empty((2, f, 3)), np.empty((2, f))
-    slopes, axis, frame, place = np.empty((2, e, f)), np.empty(3), np.empty((3, 3)), np.empty((2, 3))
-    flat, line, plane, beyond = np.empty((2, s, 3)), np.empty((2, s, 3)), np.empty((2, 3)), np.empty((2, s, s))
-    spots, code = np.empty((4 * s, 4)), np.empty(4 * s, np.int64)
-    way, ends, share, parts = np.empty((4, 3)), np.empty((4, 2), np.int64), np.empty(4), np.empty(6)
-    cores, core_place = np.empty((2, v, 3)), np.empty((2, 3))
-    p, q, p_normal, q_normal = points[0], points[1], normals[0], normals[1]
+    most_v, most_f, s, most_e = vertex.shape[1], normal.shape[1], corner.shape[2], edge.shape[1]
+    points, normals, level = np.empty((2, most_v, 3)), np.empty((2, most_f, 3)), np.empty((2, most_f))
+    core, contacts_of_faces = np.empty((2, most_v, 3)), (np.empty((4 * s, 4)), np.empty(4 * s, np.int64))
+    slopes, axis, frame, place = np.empty((2, most_e, most_f)), np.empty(3), np.empty((3, 3)), np.empty((2, 3))
+    polygons = np.empty((2, s, 3)), np.empty((2, s, 3)), np.empty((2, 3)), np.empty((2, s, s))
+    (_, line, _, _), (spots, code), simplex, core_place = polygons, contacts_of_faces, no_simplex(), np.empty((2, 3))
+    p, q, p_normal, q_normal, p_level, q_level = points[0], points[1], normals[0], normals[1], level[0], level[1]
     for m in range(done, len(hull)):
         if found + most > len(out):
             return m, found
         g, h, reach, start = hull[m], other_hull[m], delta[m], found
-        many, others = count[g], count[h]
         a, b, c = center[m, 0], center[m, 1], center[m, 2]
-        x, y, z = other_center[m, 0] - a, other_center[m, 1] - b, other_center[m, 2] - c
-        size = _place(many, vertex[g], normal[g], corner[g], turn[m], scale[m], 0.0, 0.0, 0.0, p, p_normal, level[0])
-        size = min(size, _place(
-            others, vertex[h], normal[h], corner[h], other_turn[m], other_scale[m], x, y, z, q, q_normal, level[1]
-        ))  # fmt: skip
+        between = other_center[m, 0] - a, other_center[m, 1] - b, other_center[m, 2] - c
+        many, others = count[g], count[h]
+        own, opposite = (many, vertex[g], normal[g], corner[g]), (others, vertex[h], normal[h], corner[h])
+        size = min(
+            _place(own, (0.0, 0.0, 0.0), turn[m], scale[m], p, p_normal, p_level),
+            _place(opposite, between, other_turn[m], other_scale[m], q, q_normal, q_level),
+        )
         tie, tolerance = TIE * size, FLUSH * reach + 2.0 * SNAP * size
-        flush, one = _beyond(many[1], p_normal, level[0], q, others[0], reach, tie, -np.inf, -1)
+        flush, one = _beyond(many[1], p_normal, p_level, q, others[0], reach, tie, -np.inf, -1)
         if flush > reach:
             continue
-        flush, other = _beyond(others[1], q_normal, level[1], p, many[0], reach, tie, flush, -1)
+        flush, other = _beyond(others[1], q_normal, q_level, p, many[0], reach, tie, flush, -1)
         if flush > reach:
             continue
 
         # Where faces part the two, the edges matter only if no face is clearly the nearest.
         crossed, one_edge, other_edge = -np.inf, -1, -1
         if flush <= CLOSE * size:
-            crossed, one_edge, other_edge = _crossing(
-                many[2], edge[g], wing[g], p, p_normal, others[1], others[2], edge[h], wing[h], q, q_normal, many[1],
-                slopes, tie, axis,
-            )  # fmt: skip
+            by_edges = Edges(many, p, p_normal, edge[g], wing[g]), Edges(others, q, q_normal, edge[h], wing[h])
+            crossed, one_edge, other_edge = _crossing(by_edges[0], by_edges[1], slopes, tie, axis)
         apart, laid = max(flush, crossed), 0
         if apart > reach:
             continue
@@ -725,27 +655,28 @@ def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
                 last = other
                 _frame(q_normal[last], -1.0, q[corner[h, last, 0]], q[corner[h, last, 1]], frame)
                 one = _towards(many, corner[g], p, p_normal, frame[2], 1.0, tolerance)
+            flush_faces = (corner[g, one], p, p_normal[one]), (corner[h, last], q, q_normal[last])
             of_first, of_second, of_both, least = _overlaid(
-                corner[g, one], p, p_normal[one], corner[h, last], q, q_normal[last], frame, SNAP * size, reach, flat,
-                line, plane, beyond, spots, code,
-            )  # fmt: skip
+                flush_faces[0], flush_faces[1], frame, SNAP * size, reach, polygons, contacts_of_faces
+            )
             if least <= apart + tolerance:
                 laid = of_first + of_second + of_both
                 for k in range(laid):
                     if k < of_first:
                         feature[found + k] = corner[g, one, code[k]]
                     elif k < of_first + of_second:
-                        feature[found + k] = v + corner[h, last, code[k]]
+                        feature[found + k] = most_v + corner[h, last, code[k]]
                     else:
-                        feature[found + k] = 2 * v + e * side[g, one, code[k] // s] + side[h, last, code[k] % s]
+                        sides = side[g, one, code[k] // s], side[h, last, code[k] % s]
+                        feature[found + k] = 2 * most_v + most_e * sides[0] + sides[1]
                     out[found + k, 6] = spots[k, 3]
                     for n in range(3):
                         out[found + k, n], out[found + k, 3 + n] = center[m, n], frame[2, n]
                         for i in range(3):
                             out[found + k, n] += spots[k, i] * frame[i, n]
-                sides = line[0] if other < 0 else line[1]
+                lines = line[0] if other < 0 else line[1]
                 corners = corner[g, one] if other < 0 else corner[h, last]
-                inside = _well_inside(spots, laid, corners, sides, ROUND * size * (sharp[g] + sharp[h]))
+                inside = _well_inside(spots, laid, corners, lines, ROUND * size * (sharp[g] + sharp[h]))
                 if laid == 0 or inside:
                     for k in range(found, found + laid):
                         pair[k] = m
@@ -754,55 +685,46 @@ def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
 
         # Else the direction is that of the closest points where edges and corners are round.
         if flush > CLOSE * size:
-            crossed, one_edge, other_edge = _crossing(
-                many[2], edge[g], wing[g], p, p_normal, others[1], others[2], edge[h], wing[h], q, q_normal, many[1],
-                slopes, tie, axis,
-            )  # fmt: skip
-        skin = ROUND * size
-        _within(many[0], p, inset[g], turn[m], skin, cores[0])
-        _within(others[0], q, inset[h], other_turn[m], skin, cores[1])
-        extent, more = np.sqrt(x * x + y * y + z * z), skin * (sharp[g] + sharp[h])
-        points_in, core_gap = _distance(
-            cores[0], many[0], cores[1], others[0], x, y, z, reach + more, extent, way, ends, share, parts
-        )
+            by_edges = Edges(many, p, p_normal, edge[g], wing[g]), Edges(others, q, q_normal, edge[h], wing[h])
+            crossed, one_edge, other_edge = _crossing(by_edges[0], by_edges[1], slopes, tie, axis)
+        skin, cores, ends, share = ROUND * size, (core[0, : many[0]], core[1, : others[0]]), simplex.ends, simplex.share
+        _within(p, inset[g], turn[m], skin, cores[0])
+        _within(q, inset[h], other_turn[m], skin, cores[1])
+        extent, more = np.sqrt(dot(between, between)), skin * (sharp[g] + sharp[h])
+        count_in, core_gap = _distance(cores[0], cores[1], between, reach + more, extent, simplex)
         if core_gap == np.inf:
             continue
         for t in range(2):
-            _witness(cores[t], ends[:, t], share, points_in, core_place[t])
-        if core_gap > CLOSE * size and _parts(cores[0], many[0], cores[1], others[0], core_place, core_gap):
+            _witness(cores[t], ends[:, t], share, count_in, core_place[t])
+        if core_gap > CLOSE * size and _separates(cores[0], cores[1], core_place, core_gap):
             crossing = axis[0], axis[1], axis[2]
             for t in range(3):
                 axis[t] = (core_place[1, t] - core_place[0, t]) / core_gap
-            i, k = _surface(p, ends[:, 0], share, points_in, core_place[0], axis, skin, place[0])
-            j, n = _surface(q, ends[:, 1], share, points_in, core_place[1], axis, -skin, place[1])
+            i, k = _surface(p, ends[:, 0], share, count_in, core_place[0], axis, skin, place[0])
+            j, n = _surface(q, ends[:, 1], share, count_in, core_place[1], axis, -skin, place[1])
             if laid > 0 and dot(axis, frame[2]) > 1.0 - PARALLEL:
                 for t in range(found, found + laid):
                     pair[t] = m
                 found += laid
                 continue
             gap = crossed + core_gap * (1.0 - dot(axis, crossing))
-            gap = max(gap, _rounded(many[1], p_normal, level[0], q, others[0], axis, 1.0, core_gap))
-            gap = max(gap, _rounded(others[1], q_normal, level[1], p, many[0], axis, -1.0, core_gap))
+            gap = max(gap, _rounded(many[1], p_normal, p_level, q, others[0], axis, 1.0, core_gap))
+            gap = max(gap, _rounded(others[1], q_normal, q_level, p, many[0], axis, -1.0, core_gap))
             if gap > reach:
                 continue
-            far = core_gap + min(tolerance, reach - gap)
-            found, least = _on_edges(
-                cores[0], many[0], cores[1], others[0], others[2], edge[h], axis, 1.0, tolerance, far, skin, p, q, 0,
-                found, out, feature,
-            )  # fmt: skip
+            one_body, other_body = Cored(p, cores[0], edge[g, : many[2]]), Cored(q, cores[1], edge[h, : others[2]])
+            limits = tolerance, core_gap + min(tolerance, reach - gap), skin
+            found, least = _on_edges(one_body, other_body, axis, 1.0, limits, 0, found, contacts)
             own = found
-            found, lesser = _on_edges(
-                cores[1], others[0], cores[0], many[0], many[2], edge[g], axis, -1.0, tolerance, far, skin, q, p, v,
-                found, out, feature,
-            )  # fmt: skip
+            found, lesser = _on_edges(other_body, one_body, axis, -1.0, limits, most_v, found, contacts)
             found = _each_once(out, feature, start, own, found, 2.0 * skin)
             if core_gap < min(least, lesser) - tie:
-                one_edge, other_edge = _edge_of(many[2], edge[g], i, k), _edge_of(others[2], edge[h], j, n)
+                one_edge, other_edge = _edge_of(one_body.edge, i, k), _edge_of(other_body.edge, j, n)
                 name = i
                 if k >= 0 and n < 0:
-                    name = v + j
+                    name = most_v + j
                 elif one_edge >= 0 and other_edge >= 0:
-                    name = 2 * v + e * one_edge + other_edge
+                    name = 2 * most_v + most_e * one_edge + other_edge
                 at = start
                 while at < found and feature[at] != name:
                     at += 1
@@ -823,7 +745,7 @@ def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
                 p[edge[g, one_edge, 0]], p[edge[g, one_edge, 1]], q[edge[h, other_edge, 0]], q[edge[h, other_edge, 1]],
                 place,
             )  # fmt: skip
-            feature[found] = 2 * v + e * one_edge + other_edge
+            feature[found] = 2 * most_v + most_e * one_edge + other_edge
             _set(
                 out, found, 0.5 * (place[0, 0] + place[1, 0]), 0.5 * (place[0, 1] + place[1, 1]),
                 0.5 * (place[0, 2] + place[1, 2]), axis[0], axis[1], axis[2], crossed,
@@ -835,7 +757,7 @@ def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
                 ahead = sign * dot(frame[2], q[n] if other < 0 else p[n])
                 if ahead < best:
                     best, k = ahead, n
-            feature[found] = v + k if other < 0 else k
+            feature[found] = most_v + k if other < 0 else k
             for n in range(3):
                 tip = q[k, n] if other < 0 else p[k, n]
                 out[found, n], out[found, 3 + n] = tip - 0.5 * sign * flush * frame[2, n], frame[2, n]
@@ -881,29 +803,27 @@ def _between(a, b, c, d, place):
 @loop
 def _spheres(spheres, faces, corner, body, delta, contacts):
     """Fill in the contacts of spheres with polyhedra; their number."""
-    (ball, radius), (_, count, vertex, normal), (center, turn, scale, hull) = spheres, faces, body
-    pair, feature, out = contacts
+    (ball, radius), (center, turn, scale, hull), (pair, feature, out) = spheres, body, contacts
+    (_, count, vertex, normal) = faces
     points, normals, level = np.empty(vertex.shape[1:]), np.empty(normal.shape[1:]), np.empty(normal.shape[1])
-    way, ends, share, parts = np.empty((4, 3)), np.empty((4, 2), np.int64), np.empty(4), np.empty(6)
-    middle, found = np.zeros((1, 3)), 0
+    simplex, middle, found = no_simplex(), np.zeros((1, 3)), 0
+    point, share = simplex.point, simplex.share
     for m in range(len(hull)):
-        h, reach = hull[m], delta[m] + radius[m]
-        x, y, z = center[m, 0] - ball[m, 0], center[m, 1] - ball[m, 1], center[m, 2] - ball[m, 2]
-        size = _place(
-            count[h], vertex[h], normal[h], corner[h], turn[m], scale[m], x, y, z, points, normals, level
-        )
+        reach = delta[m] + radius[m]
+        apart = center[m, 0] - ball[m, 0], center[m, 1] - ball[m, 1], center[m, 2] - ball[m, 2]
+        h = hull[m]
+        size = _place((count[h], vertex[h], normal[h], corner[h]), apart, turn[m], scale[m], points, normals, level)
         gap, face = _beyond(count[h, 1], normals, level, middle, 1, reach, TIE * size, -np.inf, -1)
         if gap > reach:
             continue
         u, v, w = -normals[face, 0], -normals[face, 1], -normals[face, 2]
         if gap > CLOSE * size:
-            extent = np.sqrt(x * x + y * y + z * z)
-            many, gap = _distance(middle, 1, points, count[h, 0], x, y, z, reach, extent, way, ends, share, parts)
+            many, gap = _distance(middle, points[: count[h, 0]], apart, reach, np.sqrt(dot(apart, apart)), simplex)
             if gap > reach:
                 continue
             u, v, w = 0.0, 0.0, 0.0
             for k in range(many):
-                u, v, w = u + share[k] * way[k, 0], v + share[k] * way[k, 1], w + share[k] * way[k, 2]
+                u, v, w = u + share[k] * point[k, 0], v + share[k] * point[k, 1], w + share[k] * point[k, 2]
             gap = np.sqrt(u * u + v * v + w * w)
             u, v, w = u / gap, v / gap, w / gap
         gap -= radius[m]

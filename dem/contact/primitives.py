@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import combinations, combinations_with_replacement, product
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -39,12 +39,14 @@ from dem.contact.polyhedra import (
 )
 from dem.contact.spheres import touch_spheres
 from dem.mesh import Mesh, Surface
-from dem.model.neighbourhood import Neighbourhood
 from dem.motion import Dynamic
-from dem.scene import LargeBody
 from dem.shapes import CONVEX_SHAPES, Shape, placed
 from dem.shapes.convex import Convex, centred
 from dem.shapes.forms import Form
+
+if TYPE_CHECKING:
+    from dem.model.neighbourhood import Neighbourhood
+    from dem.scene import LargeBody
 
 
 class Primitives(NamedTuple):

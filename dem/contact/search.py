@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,8 +21,10 @@ from dem.model.neighbourhood import Neighbourhood, refreshed
 from dem.model.world import World
 from dem.parts.cell import Cell
 from dem.quaternion import cross, length
-from dem.unconstrained import UnconstrainedMotion
 from dem.unconstrained.drives import free_directions, free_turns
+
+if TYPE_CHECKING:
+    from dem.unconstrained import UnconstrainedMotion
 
 #: Margin of a grain over the way that it goes in a step without contact forces: those that push it on often add a part.
 FURTHER = 1.25
@@ -78,7 +80,7 @@ class Contacts:
         """The gaps (nc,) to which the normal velocities of a step times dt are added [m]."""
         return self.gap if self.linear is None else self.linear
 
-    def way(self, position: Floats) -> Floats:
+    def branch(self, position: Floats) -> Floats:
         """From the centre of body a to that of body b, or of its image (nc, 3), at these positions (rows, 3) [m]."""
         way = position[self.b] - position[self.a]
         return way if self.moved is None else way + self.moved
@@ -88,7 +90,7 @@ class Contacts:
         its shear and as it changes its size; None: nothing [m/s]."""
         if not cell.deforms:
             return self.drift
-        affine: Floats = cell.rate * self.way(position)
+        affine: Floats = cell.rate * self.branch(position)
         return affine if self.drift is None else self.drift + affine
 
     def take(self, rows: np.ndarray) -> Contacts:
@@ -141,7 +143,7 @@ def _margins(
     dt, velocity = (0.0, world.grains.velocity) if free is None else (free.dt, free.grains)
     if shifts is None:
         shifts = (np.zeros(world.large.velocity.shape) if free is None else dt * free.drives.free)[None]
-    way = ways(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
+    way = greatest_travel(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
     way = way + world.cell.margin(dt, world.grains)
     return np.maximum(np.maximum(delta / 2, way), least), way, shifts
 
@@ -270,7 +272,7 @@ def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Keys
     return np.lexsort((key, owner, foreign[a] | foreign[b]))
 
 
-def goes_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
+def exceeds_margin(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
     """Whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as in one
     of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
     free = bodies.is_dynamic(world.large)
@@ -285,7 +287,7 @@ def goes_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool
 
 
 @loop
-def ways(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
+def greatest_travel(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
     """About how far (n,) a point of each grain goes in dt [s], at most two of its radii [m]. For spheres it is the
     centre's way, as turning does not move their surface. NaN where the velocity is not finite."""
     out = np.empty(len(shape))

@@ -3,6 +3,9 @@
 ``body`` (nc, 2) has local numbers of bodies. w and m (bodies, 6) are physical velocities and momenta. The loops run
 over all contacts of their arrays, not between two given bounds, and the numbers of bodies are unsigned. Otherwise every
 index could be negative, and the test for this costs a third of a product.
+
+A cell whose periods grow at the rates E (3,) adds E l to the velocity of a contact, with the way l from centre to
+centre, which is the difference of the arms. `rate` and `pushed` are empty where there is none.
 """
 
 from __future__ import annotations
@@ -11,6 +14,8 @@ import numpy as np
 
 from dem.arrays import Floats
 from dem.compiled import PART, inlined, loop, prange
+
+NUMBERS = 1536  # that stay in the nearest cache, of loops that become vectors
 
 
 @inlined
@@ -44,10 +49,14 @@ def push(c, arm, body, f0, f1, f2, m):
 
 
 @loop
-def set_velocities(frame, arm, body, before, y, w):
-    """y = before + D' w (nc, 3); y may be ``before``."""
+def set_velocities(frame, arm, body, before, y, w, rate):
+    """y = before + D' w (nc, 3), and what the rates (3,) of a cell add; y may be ``before``."""
     for c in prange(len(body)):
         u0, u1, u2 = velocity_at(c, arm, body, w)
+        if len(rate):
+            u0 += rate[0] * (arm[c, 0] - arm[c, 3])
+            u1 += rate[1] * (arm[c, 1] - arm[c, 4])
+            u2 += rate[2] * (arm[c, 2] - arm[c, 5])
         y[c, 0] = before[c, 0] + (frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2)
         y[c, 1] = before[c, 1] + (frame[c, 3] * u0 + frame[c, 4] * u1 + frame[c, 5] * u2)
         y[c, 2] = before[c, 2] + (frame[c, 6] * u0 + frame[c, 7] * u1 + frame[c, 8] * u2)
@@ -56,7 +65,7 @@ def set_velocities(frame, arm, body, before, y, w):
 def relative_velocities(frame, arm, body, w) -> Floats:
     """D' w (nc, 3)."""
     y = np.zeros((len(body), 3))
-    set_velocities(frame, arm, body, y, y, w)
+    set_velocities(frame, arm, body, y, y, w, np.zeros(0))
     return y
 
 
@@ -98,14 +107,31 @@ def works(frame, arm, body, g, w, new_w):
 
 
 @loop
-def add_momenta(frame, arm, body, g, m):
-    """m += D g for impulses g (nc, 3)."""
+def add_momenta(frame, arm, body, g, m, pushed):
+    """m += D g for impulses g (nc, 3), and ``pushed`` (3,) += what they do to the rates of a cell."""
+    x, y, z = 0.0, 0.0, 0.0
     for c in range(len(body)):
         g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
         f0 = frame[c, 0] * g0 + frame[c, 3] * g1 + frame[c, 6] * g2
         f1 = frame[c, 1] * g0 + frame[c, 4] * g1 + frame[c, 7] * g2
         f2 = frame[c, 2] * g0 + frame[c, 5] * g1 + frame[c, 8] * g2
         push(c, arm, body, f0, f1, f2, m)
+        if len(pushed):
+            x += f0 * (arm[c, 0] - arm[c, 3])
+            y += f1 * (arm[c, 1] - arm[c, 4])
+            z += f2 * (arm[c, 2] - arm[c, 5])
+    if len(pushed):
+        pushed[0] += x
+        pushed[1] += y
+        pushed[2] += z
+
+
+@loop
+def add_pushes(arm, f, pushed):
+    """``pushed`` (3,) += what forces f (nc, 3) of contacts do to the rates of a cell."""
+    for c in range(len(f)):
+        for k in range(3):
+            pushed[k] += f[c, k] * (arm[c, k] - arm[c, 3 + k])
 
 
 @loop
@@ -235,12 +261,16 @@ def add_body_blocks(frame, arm, body, weight, blocks):
 
 
 @loop
-def contact_blocks(frame, arm, body, mass, out):
+def contact_blocks(frame, arm, body, mass, mobility, out):
     """out (nc, 3, 3) = diagonal blocks of D' M^-1 D; ``mass`` (bodies, 6 or 12) is M^-1 in the format of
-    `CompactRows.root`."""
+    `CompactRows.root`, ``mobility`` (3,) that of the rates of a cell."""
     W = np.empty(6)  # from an impulse at the contact point to its velocity, the upper triangle
     for c in range(len(frame)):
         W[:] = 0.0
+        if len(mobility):
+            W[0] = mobility[0] * (arm[c, 0] - arm[c, 3]) ** 2
+            W[3] = mobility[1] * (arm[c, 1] - arm[c, 4]) ** 2
+            W[5] = mobility[2] * (arm[c, 2] - arm[c, 5]) ** 2
         for side in range(2):
             n = body[c, side]
             x, y, z = arm[c, 3 * side], arm[c, 3 * side + 1], arm[c, 3 * side + 2]
@@ -304,17 +334,30 @@ def scale_extrapolated(mass, m, last_m, beta, out):
     """out = M^-1 (m + beta (m - last_m)) for the bodies of ``mass``, which is M^-1 in the format of
     `CompactRows.root`."""
     way = m.dtype.type(beta)
-    for i in prange(len(mass)):
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
-            mass, i, extrapolated(m, last_m, way, i, 0), extrapolated(m, last_m, way, i, 1),
-            extrapolated(m, last_m, way, i, 2), extrapolated(m, last_m, way, i, 3),
-            extrapolated(m, last_m, way, i, 4), extrapolated(m, last_m, way, i, 5),
-        )  # fmt: skip
+    if mass.shape[1] == 6:
+        each, now, last, to = mass.ravel(), m.ravel(), last_m.ravel(), out.reshape(out.size)
+        for part in prange((len(each) + NUMBERS - 1) // NUMBERS):
+            a, b = part * NUMBERS, min(part * NUMBERS + NUMBERS, len(each))
+            _scale_numbers(each[a:b], now[a:b], last[a:b], way, to[a:b])
+    else:
+        for i in prange(len(mass)):
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
+                mass, i, extrapolated(m, last_m, way, i, 0), extrapolated(m, last_m, way, i, 1),
+                extrapolated(m, last_m, way, i, 2), extrapolated(m, last_m, way, i, 3),
+                extrapolated(m, last_m, way, i, 4), extrapolated(m, last_m, way, i, 5),
+            )  # fmt: skip
+
+
+@loop
+def _scale_numbers(mass, m, last_m, beta, out):
+    for k in range(len(mass)):
+        out[k] = mass[k] * (m[k] + beta * (m[k] - last_m[k]))
 
 
 @loop
 def energy_of_step(mass, new_m, m, last_m, beta):
-    """d' M^-1 d of d = new_m - (m + beta (m - last_m)), summed in double precision over the bodies of ``mass``."""
+    """d' M^-1 d of d = new_m - (m + beta (m - last_m)), summed in double precision over parts of the bodies of
+    ``mass``."""
     way = m.dtype.type(beta)
     sums = np.zeros((len(mass) + PART - 1) // PART)
     for part in prange(len(sums)):
@@ -324,18 +367,34 @@ def energy_of_step(mass, new_m, m, last_m, beta):
 
 
 @loop
-def _energy_of_part(mass, new_m, m, last_m, way):
+def _energy_of_part(mass, new_m, m, last_m, beta):
     energy = 0.0
+    if mass.shape[1] == 6:
+        each, new, now, last = mass.ravel(), new_m.ravel(), m.ravel(), last_m.ravel()
+        sums = np.zeros(NUMBERS, mass.dtype)
+        for a in range(0, len(each), NUMBERS):
+            b = min(a + NUMBERS, len(each))
+            _add_energies(each[a:b], new[a:b], now[a:b], last[a:b], beta, sums)
+        for k in range(len(sums)):
+            energy += sums[k]
+        return energy
     for i in range(len(mass)):
-        d0 = new_m[i, 0] - extrapolated(m, last_m, way, i, 0)
-        d1 = new_m[i, 1] - extrapolated(m, last_m, way, i, 1)
-        d2 = new_m[i, 2] - extrapolated(m, last_m, way, i, 2)
-        d3 = new_m[i, 3] - extrapolated(m, last_m, way, i, 3)
-        d4 = new_m[i, 4] - extrapolated(m, last_m, way, i, 4)
-        d5 = new_m[i, 5] - extrapolated(m, last_m, way, i, 5)
+        d0 = new_m[i, 0] - extrapolated(m, last_m, beta, i, 0)
+        d1 = new_m[i, 1] - extrapolated(m, last_m, beta, i, 1)
+        d2 = new_m[i, 2] - extrapolated(m, last_m, beta, i, 2)
+        d3 = new_m[i, 3] - extrapolated(m, last_m, beta, i, 3)
+        d4 = new_m[i, 4] - extrapolated(m, last_m, beta, i, 4)
+        d5 = new_m[i, 5] - extrapolated(m, last_m, beta, i, 5)
         v0, v1, v2, v3, v4, v5 = scaled_row(mass, i, d0, d1, d2, d3, d4, d5)
         energy += d0 * v0 + d1 * v1 + d2 * v2 + d3 * v3 + d4 * v4 + d5 * v5
     return energy
+
+
+@loop
+def _add_energies(mass, new_m, m, last_m, beta, sums):
+    for k in range(len(mass)):
+        d = new_m[k] - (m[k] + beta * (m[k] - last_m[k]))
+        sums[k] += mass[k] * (d * d)
 
 
 @loop

@@ -58,6 +58,7 @@ class ContactMap:
         self.log_flops: Callable[[float], None] = lambda count: None  #: told how many operations a product took
         self._arrays = self._floats(given.frame), self._floats(given.arm), body
         self._w, self._m = np.zeros((2, halo.rows, 6), precision)
+        self._pushed = np.zeros(self.mass.axes)  # by the impulses that were collected last, on this rank
         ghost = np.zeros(halo.rows, bool)
         ghost[halo.ghosts] = True
         self._first_away = first_touching(body, ghost) if len(halo.ghosts) else self.rows
@@ -70,8 +71,9 @@ class ContactMap:
 
     def part(self, contacts: Ints) -> ContactMap:
         """The map of these contacts alone, ascending, which shares the bodies with this one. Collective."""
-        given, mass = self.given.only(contacts), self.mass.only(contacts)
-        return ContactMap(self.comm, given, self.halo, self.body[contacts], self.precision, mass)
+        return ContactMap(
+            self.comm, self.given.only(contacts), self.halo, self.body[contacts], self.precision, self.mass
+        )
 
     # -- products -------------------------------------------------------------------------------------------
 
@@ -79,8 +81,7 @@ class ContactMap:
         """G v (nc, 3)."""
         y, v = np.zeros((self.rows, 3), self.precision), shaped("velocities of bodies", v, self.columns, 6)
         self._enter(v)
-        self._set_velocities(y, y)
-        self.mass.add_rates(v, y)
+        self._set_velocities(y, y, self.mass.rates_of(v))
         self.log_flops(self._flops)
         return y
 
@@ -88,23 +89,22 @@ class ContactMap:
         """G' g (columns, 6)."""
         self._collect(g, self._m)
         self.log_flops(self._flops)
-        return self.mass.momenta(g.reshape(-1, 3), self._m)
+        return self.mass.momenta(self._m, self._pushed)
 
     def add_delassus(self, g: Floats, y: Floats) -> None:
         """y += G G' g; y (nc, 3) is C-contiguous."""
         y = shaped("velocities of contacts", y, self.rows, 3)
         self._collect(g, self._m)
-        shared = self._share(g, self._m)
+        shared = self._share(self._m)
         loops.scale(self.mass.alone, self._m, self._w)
         self._send(shared)
-        self._set_velocities(y, y)
-        self.mass.add_contacts(shared, y)
+        self._set_velocities(y, y, self.mass.rates(shared))
         self.log_flops(2 * self._flops)
 
     def shared(self, g: Floats) -> Floats:
         """The shared coordinates (mass.shared, 6) of impulses g (nc, 3), see `dem.contact_map.mass`."""
         self._collect(g, self._m)
-        return self._share(g, self._m)
+        return self._share(self._m)
 
     # What an iterate x is to the bodies: its image, the momenta D x and behind them its shared coordinates, from which
     # velocities G G'x and energies x'G G'x follow. A map of those contacts `only` that have impulses finds the same
@@ -114,7 +114,6 @@ class ContactMap:
         """The map of these contacts, ascending, for images and what follows from them: it shares the memory for
         velocities and momenta with this one."""
         other = copy.copy(self)
-        other.mass = self.mass.only(contacts)
         other._take(contacts)
         return other
 
@@ -144,7 +143,7 @@ class ContactMap:
         """image = D x for impulses x (nc, 3)."""
         count = self.halo.rows
         self._collect(x, image[:count])
-        self.mass.share(x, image[:count], image[count:])
+        self.mass.share(image[:count], self._pushed, image[count:])
         self.log_flops(self._flops)
 
     def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats) -> None:
@@ -153,8 +152,7 @@ class ContactMap:
         shared = image[count:] + self.precision(beta) * (image[count:] - last[count:])
         loops.scale_extrapolated(self.mass.alone, image, last, beta, self._w)
         self._send(shared)
-        self._set_velocities(before, y)
-        self.mass.add_contacts(shared, y)
+        self._set_velocities(before, y, self.mass.rates(shared))
         self.log_flops(self._flops + 12 * self.columns)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
@@ -180,7 +178,7 @@ class ContactMap:
             self._sum_forces(self._m)
         else:
             self._add_through(weight)
-        np.add(v, self.mass.momenta(np.empty((0, 3)), self._m), out=out.reshape(-1, 6))
+        np.add(v, self.mass.momenta(self._m, np.zeros(self.mass.axes)), out=out.reshape(-1, 6))
         self.log_flops(72 * self.rows + 18 * self.columns)
 
     def _add_through(self, weight: Floats) -> None:
@@ -214,7 +212,7 @@ class ContactMap:
         sums = np.zeros((self.halo.rows, 6))
         g = self._floats(shaped("impulses", g, self.rows, 3))
         frame, arm, body = self._arrays
-        loops.add_momenta(frame[contacts], arm[contacts], body[contacts], g[contacts], sums)
+        loops.add_momenta(frame[contacts], arm[contacts], body[contacts], g[contacts], sums, np.zeros(0))
         return sums
 
     def _enter(self, v: Floats) -> None:
@@ -225,10 +223,10 @@ class ContactMap:
         self.mass.scale(v, self._w)
         self.halo.begin_update(self._w)
 
-    def _share(self, g: Floats, m: Floats) -> Floats:
-        """The shared coordinates (mass.shared, 6) of impulses that give bodies the momenta m."""
+    def _share(self, m: Floats) -> Floats:
+        """The shared coordinates (mass.shared, 6) of the impulses that were collected, with the momenta m."""
         shared = np.zeros((self.mass.shared, 6), self.precision)
-        self.mass.share(g.reshape(-1, 3), m, shared)
+        self.mass.share(m, self._pushed, shared)
         return shared
 
     def _send(self, shared: Floats) -> None:
@@ -236,27 +234,30 @@ class ContactMap:
         self.mass.add_bodies(shared, self._w)
         self.halo.begin_update(self._w)
 
-    def _set_velocities(self, before: Floats, y: Floats) -> None:
-        """y = before + D' w (nc, 3), with the velocities w that are on their way."""
+    def _set_velocities(self, before: Floats, y: Floats, rate: Floats) -> None:
+        """y = before + D' w (nc, 3), with the velocities w that are on their way, and the rates of a cell."""
         here, frame, arm, body = self._own
-        loops.set_velocities(frame, arm, body, before[here], y[here], self._w)
+        loops.set_velocities(frame, arm, body, before[here], y[here], self._w, rate)
         self.halo.end_update(self._w)
         for here, frame, arm, body in self._away:
-            loops.set_velocities(frame, arm, body, before[here], y[here], self._w)
+            loops.set_velocities(frame, arm, body, before[here], y[here], self._w, rate)
 
     def _collect(self, g: Floats, m: Floats) -> None:
-        """m = the momenta that impulses give to the bodies, not yet scaled by masses."""
+        """m = the momenta that impulses give to the bodies, not yet scaled by masses; and what they push of a cell."""
         g = self._floats(shaped("impulses", g, self.rows, 3))
+        self._pushed[:] = 0.0
         if threads() > 1:
             loops.find_forces(self._arrays[0], g, self._forces)
+            if len(self._pushed):
+                loops.add_pushes(self._arrays[1], self._forces, self._pushed)
             self._sum_forces(m)
             return
         m[:] = 0.0
         for here, frame, arm, body in self._away:
-            loops.add_momenta(frame, arm, body, g[here], m)
+            loops.add_momenta(frame, arm, body, g[here], m, self._pushed)
         self.halo.begin_add(m)
         here, frame, arm, body = self._own
-        loops.add_momenta(frame, arm, body, g[here], m)
+        loops.add_momenta(frame, arm, body, g[here], m, self._pushed)
         self.halo.end_add(m)
 
     def _sum_forces(self, m: Floats) -> None:
@@ -291,8 +292,7 @@ class ContactMap:
         mass = np.zeros((self.halo.rows, self.mass.square.shape[1]), self.precision)
         mass[: self.halo.own] = self.mass.square
         self.halo.update(mass)
-        loops.contact_blocks(*self._arrays, mass, out)
-        self.mass.add_blocks(out)
+        loops.contact_blocks(*self._arrays, mass, self.mass.mobility, out)
         return out
 
     def body_blocks(self, weight: Floats) -> Floats:
@@ -314,7 +314,7 @@ class ContactMap:
         """The map with its rows multiplied by ``size`` (nc, 3)."""
         frame = np.empty((self.rows, 9), precision)
         loops.scale_frames(self.given.frame, size, frame)
-        mass = self.mass.scaled(size, precision)
+        mass = self.mass.rounded(precision)
         other = ContactMap(self.comm, replace(self.given, frame=frame), self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
         if threads() > 1:
@@ -328,7 +328,7 @@ class ContactMap:
     @cached_property
     def block_rows(self) -> BlockRows:
         """The rows as 3 x 6 blocks; collective at its first use."""
-        return self.mass.rows(self.comm, self.body_rows)
+        return self.mass.rows(self.comm, self.given, self.body_rows)
 
     @cached_property
     def body_rows(self) -> BlockRows:

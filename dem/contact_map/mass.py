@@ -7,17 +7,19 @@ and a small matrix of s. An image of impulses (see `dem.contact_map.ContactMap`)
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import copy
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 
 from dem.arrays import Floats, Ints
-from dem.compiled import loop
 from dem.contact_map import loops
-from dem.contact_map.rows import BlockRows, root_blocks, squared
+from dem.contact_map.rows import BlockRows, CompactRows, root_blocks, squared
 from dem.exchange import offsets
+
+Mass = TypeVar("Mass", bound="InverseMass")
 
 ROUNDING = 1e-14  # of the coupling of bodies that no chain of constraints joins
 
@@ -28,51 +30,55 @@ class InverseMass:
     couples = False  #: whether more than contacts couples bodies
     shared = 0  #: number of rows (6,) of the shared coordinates
     more = 0  #: columns of this rank beside those of bodies
+    axes = 0  #: along which a cell changes its size: 3, or 0
 
     def __init__(self, root: Floats, precision: type[np.floating] = np.float64):
-        self.given, self.precision = root, precision
+        self.precision = precision
         self.root, self.square = (np.ascontiguousarray(x, dtype=precision) for x in (root, squared(root)))
         self.alone = self.square  #: M^-1 of the bodies that are in no shared coordinate, else zero
 
-    def scaled(self, size: Floats, precision: type[np.floating]) -> InverseMass:
-        """The same for contacts whose rows are multiplied by ``size`` (rows, 3)."""
-        return InverseMass(self.given, precision)
-
-    def only(self, contacts: Ints) -> InverseMass:
-        """The same for these contacts."""
-        return self
+    def rounded(self: Mass, precision: type[np.floating]) -> Mass:
+        """The same in this precision."""
+        other = copy.copy(self)
+        tables = (np.ascontiguousarray(x, dtype=precision) for x in (self.root, self.square, self.alone))
+        other.precision, (other.root, other.square, other.alone) = precision, tables
+        return other
 
     def scale(self, v: Floats, out: Floats) -> None:
         """out = R v for the own bodies, of mass-scaled velocities v (columns, 6)."""
         loops.scale(self.root, v, out)
 
-    def momenta(self, g: Floats, m: Floats) -> Floats:
-        """R m (columns, 6) of impulses g (rows, 3), which give bodies the momenta m."""
+    def momenta(self, m: Floats, pushed: Floats) -> Floats:
+        """R m (columns, 6) of impulses that give bodies the momenta m, and a cell the push (axes,) of this rank;
+        collective where bodies are coupled."""
         out = np.empty((len(self.root), 6), self.precision)
         loops.scale(self.root, m, out)
         return out
 
-    def share(self, g: Floats, m: Floats, s: Floats) -> None:
-        """s (shared, 6) = the shared coordinates of impulses g (rows, 3), which give bodies the momenta m; collective
-        where bodies are coupled."""
+    def share(self, m: Floats, pushed: Floats, s: Floats) -> None:
+        """s (shared, 6) = the shared coordinates of such impulses; collective where bodies are coupled."""
 
     def add_bodies(self, s: Floats, w: Floats) -> None:
         """w += the velocities of the own bodies by s."""
 
-    def add_contacts(self, s: Floats, y: Floats) -> None:
-        """y (rows, 3) += the relative velocities of contacts by s that no body has."""
+    def rates(self, s: Floats) -> Floats:
+        """The rates (axes,) of a cell by s."""
+        return np.zeros(0, self.precision)
 
-    def add_rates(self, v: Floats, y: Floats) -> None:
-        """y (rows, 3) += those of mass-scaled velocities v (columns, 6); collective."""
+    def rates_of(self, v: Floats) -> Floats:
+        """The rates (axes,) of mass-scaled velocities v (columns, 6); collective."""
+        return np.zeros(0, self.precision)
+
+    @property
+    def mobility(self) -> Floats:
+        """That of the rates (axes,)."""
+        return np.zeros(0, self.precision)
 
     def energy(self, s: Floats) -> float:
         """s' M^-1 s, on one rank."""
         return 0.0
 
-    def add_blocks(self, out: Floats) -> None:
-        """The diagonal blocks of G G' (rows, 3, 3) += those by s that no body has."""
-
-    def rows(self, comm: MPI.Comm, known: BlockRows) -> BlockRows:
+    def rows(self, comm: MPI.Comm, given: CompactRows, known: BlockRows) -> BlockRows:
         """The rows of G from those of the bodies alone; collective."""
         return known
 
@@ -102,9 +108,6 @@ class ConstrainedMass(InverseMass):
         self.alone[here] = 0.0
         self._root = root_blocks(root[here])
 
-    def scaled(self, size: Floats, precision: type[np.floating]) -> ConstrainedMass:
-        return ConstrainedMass(self.comm, self.given, self.here, self.slot, self.coupling, precision)
-
     def uncoupled(self, z: Floats) -> Floats:
         """(I - K) z for z (shared, 6) of all constrained bodies."""
         x = z.astype(float, copy=False)
@@ -126,10 +129,10 @@ class ConstrainedMass(InverseMass):
     def scale(self, v: Floats, out: Floats) -> None:
         super().scale(self.held(v), out)
 
-    def momenta(self, g: Floats, m: Floats) -> Floats:
-        return self.held(super().momenta(g, m))
+    def momenta(self, m: Floats, pushed: Floats) -> Floats:
+        return self.held(super().momenta(m, pushed))
 
-    def share(self, g: Floats, m: Floats, s: Floats) -> None:
+    def share(self, m: Floats, pushed: Floats, s: Floats) -> None:
         own = self._scaled(m[self.here])
         out = np.zeros((self.shared, 6))
         out[self.slot] = own
@@ -148,7 +151,7 @@ class ConstrainedMass(InverseMass):
         z = self.uncoupled(s)
         return float(np.vdot(z, z)) if self.comm.rank == 0 else 0.0
 
-    def rows(self, comm: MPI.Comm, known: BlockRows) -> BlockRows:
+    def rows(self, comm: MPI.Comm, given: CompactRows, known: BlockRows) -> BlockRows:
         """Contacts of a constrained body have a block for each body that constraints couple it with."""
         number = np.zeros(self.shared, np.int64)
         number[self.slot] = offsets(comm, known.columns)[comm.rank] + self.here
@@ -168,7 +171,6 @@ class ConstrainedMass(InverseMass):
 class CellStep(NamedTuple):
     """What a step knows of its cell."""
 
-    lever: Floats  #: (nc, 9) the frames of the contacts, with columns times the ways from centre to centre [m]
     root: Floats  #: (3,) root of the mobilities of E; 0 along an axis whose rate is given [1 / (m sqrt(kg))]
     free: Floats  #: (3,) E without contacts [1/s]
 
@@ -177,98 +179,65 @@ class CellMass(InverseMass):
     """The inverse mass of bodies in a periodic cell whose size follows from the step: the rates of its periods are
     unknowns beside the velocities of the bodies.
 
-    With the rates E (3,) of the periods, the relative velocity of a contact has the part F l E, of its frame F and the
+    With the rates E (3,) of the periods, the relative velocity of a contact has the part F E l, of its frame F and the
     way l from centre to centre, component by component. With a mobility of E, the map has three more columns, and the
     cell is a body that touches all contacts: its row is behind those of the bodies of the last rank. The shared
     coordinates are its push, the sum of the impulses with the ways [N s m].
     """
 
-    couples, shared = True, 1
+    couples, shared, axes = True, 1, 3
 
     def __init__(self, comm: MPI.Comm, root: Floats, cell: CellStep, precision: type[np.floating] = np.float64):
         super().__init__(root, precision)
         self.comm, self.cell = comm, cell
         self.more = int(comm.rank == comm.size - 1)
-        self._lever = cell.lever.astype(precision, copy=False)
 
-    def scaled(self, size: Floats, precision: type[np.floating]) -> CellMass:
-        count = len(self.cell.lever)
-        lever = (self.cell.lever.reshape(-1, 3, 3) * size[:count, :, None]).reshape(-1, 9)
-        return CellMass(self.comm, self.given, self.cell._replace(lever=lever), precision)
-
-    def only(self, contacts: Ints) -> CellMass:
-        lever = np.take(self.cell.lever, contacts, axis=0)
-        return CellMass(self.comm, self.given, self.cell._replace(lever=lever), self.precision)
-
-    def momenta(self, g: Floats, m: Floats) -> Floats:
+    def momenta(self, m: Floats, pushed: Floats) -> Floats:
         out = np.zeros((len(self.root) + self.more, 6), self.precision)
         loops.scale(self.root, m, out)
-        push = self.push(g)
+        push = self.summed(pushed)
         if self.more:
             out[-1, :3] = self.cell.root * push
         return out
 
-    def push(self, g: Floats) -> Floats:
-        """What impulses g (rows, 3) of all ranks do to E: their sum over the contacts with the ways (3,) [N s m]."""
-        out = np.zeros(3)
-        add_pushes(self._lever, g, out)
+    def summed(self, pushed: Floats) -> Floats:
+        """The sum (3,) of the pushes (3,) of all ranks [N s m]."""
+        out = pushed.copy()
         if self.comm.size > 1:
             self.comm.Allreduce(MPI.IN_PLACE, out)
         return out
 
-    def share(self, g: Floats, m: Floats, s: Floats) -> None:
-        s[0, :3] = self.push(g)
+    def share(self, m: Floats, pushed: Floats, s: Floats) -> None:
+        s[0, :3] = self.summed(pushed)
 
-    def add_contacts(self, s: Floats, y: Floats) -> None:
-        self.add_flow(self.cell.root**2 * s[0, :3], y)
+    def rates(self, s: Floats) -> Floats:
+        return self._rounded(self.cell.root**2 * s[0, :3])
 
-    def add_flow(self, rate: Floats, y: Floats) -> None:
-        """y (rows, 3) += the relative velocities that E = `rate` (3,) gives contacts."""
-        add_rates(self._lever, rate, y)
+    def _rounded(self, rate: Floats) -> Floats:
+        return rate.astype(self.precision)
 
     def rate_of(self, v: Floats) -> Floats:
         """E (3,), the same on all ranks, of mass-scaled velocities (columns, 6); collective."""
         rate = self.cell.root * v.reshape(-1, 6)[-1, :3] if self.more else np.empty(3)
         return np.asarray(self.comm.bcast(rate, self.comm.size - 1))
 
-    def add_rates(self, v: Floats, y: Floats) -> None:
-        self.add_flow(self.rate_of(v), y)
+    def rates_of(self, v: Floats) -> Floats:
+        return self._rounded(self.rate_of(v))
+
+    @property
+    def mobility(self) -> Floats:
+        return self._rounded(self.cell.root**2)
 
     def energy(self, s: Floats) -> float:
         step = s[0, :3] * self.cell.root
         return float(step @ step) if self.more else 0.0
 
-    def add_blocks(self, out: Floats) -> None:
-        lever = self._lever.reshape(-1, 3, 3) * self.cell.root.astype(self.precision)
-        out[: len(lever)] += lever @ lever.transpose(0, 2, 1)
-
-    def rows(self, comm: MPI.Comm, known: BlockRows) -> BlockRows:
+    def rows(self, comm: MPI.Comm, given: CompactRows, known: BlockRows) -> BlockRows:
         """The rows of the bodies, with a block of the cell for each contact."""
-        count, columns = len(self._lever), known.columns + self.more
-        blocks = np.zeros((count, 3, 6))
-        blocks[:, :, :3] = self.cell.lever.reshape(-1, 3, 3) * self.cell.root
+        count, columns = given.rows, known.columns + self.more
+        blocks, way = np.zeros((count, 3, 6)), given.arm[:, :3] - given.arm[:, 3:]
+        blocks[:, :, :3] = given.frame.reshape(-1, 3, 3) * (way * self.cell.root)[:, None]
         ends, last = known.indptr[1 : count + 1], offsets(comm, columns)[-1] - 1
         indptr = known.indptr + np.minimum(np.arange(len(known.indptr)), count)
         indices, blocks = np.insert(known.indices, ends, last), np.insert(known.blocks, ends, blocks, axis=0)
         return BlockRows(indptr, indices, blocks, columns)
-
-
-@loop
-def add_pushes(lever, g, out):
-    """out (3,) += lever' g of the contacts (nc, 9), in double precision."""
-    x, y, z = 0.0, 0.0, 0.0
-    for c in range(len(lever)):
-        x += lever[c, 0] * g[c, 0] + lever[c, 3] * g[c, 1] + lever[c, 6] * g[c, 2]
-        y += lever[c, 1] * g[c, 0] + lever[c, 4] * g[c, 1] + lever[c, 7] * g[c, 2]
-        z += lever[c, 2] * g[c, 0] + lever[c, 5] * g[c, 1] + lever[c, 8] * g[c, 2]
-    out[0] += x
-    out[1] += y
-    out[2] += z
-
-
-@loop
-def add_rates(lever, rate, y):
-    """y (nc or more, 3) += lever rate in the contacts (nc, 9)."""
-    for c in range(len(lever)):
-        for i in range(3):
-            y[c, i] += lever[c, 3 * i] * rate[0] + lever[c, 3 * i + 1] * rate[1] + lever[c, 3 * i + 2] * rate[2]

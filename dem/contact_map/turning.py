@@ -40,9 +40,8 @@ class TurningMap(ContactMap):
 
     def part(self, contacts: Ints) -> TurningMap:
         """The map of these contacts alone, ascending, which shares the bodies with this one. Collective."""
-        given, mass = self.given.only(contacts), self.mass.only(contacts)
-        turn, body = self._given_turn[contacts], self.body[contacts]
-        return TurningMap(self.comm, given, turn, self.halo, body, self.precision, mass)
+        given, turn, body = self.given.only(contacts), self._given_turn[contacts], self.body[contacts]
+        return TurningMap(self.comm, given, turn, self.halo, body, self.precision, self.mass)
 
     def turning(self, v: Floats) -> Floats:
         """The turning velocities (nc, 3) of the velocities (rows, 6) of all rows of a table of the halo, without a
@@ -60,14 +59,14 @@ class TurningMap(ContactMap):
         self._turn = np.take(self._turn, contacts, axis=0)
         self.contacts, self.rows = self.rows, 2 * self.rows
 
-    def _set_velocities(self, before: Floats, y: Floats) -> None:
+    def _set_velocities(self, before: Floats, y: Floats, rate: Floats) -> None:
         n = self.contacts
-        super()._set_velocities(before[:n], y[:n])
+        super()._set_velocities(before[:n], y[:n], rate)
         set_turning(self._turn, self.body, before[n:], y[n:], self._w)
 
     def _collect(self, g: Floats, m: Floats) -> None:
         g, n = self._floats(shaped("impulses", g, self.rows, 3)), self.contacts
-        m[:] = 0.0
+        m[:], self._pushed[:] = 0.0, 0.0
         for part in self._away:
             self._add_impulses(part, g[:n], g[n:], m)
         self.halo.begin_add(m)
@@ -76,7 +75,7 @@ class TurningMap(ContactMap):
 
     def _add_impulses(self, part: tuple[Any, ...], force: Floats, moment: Floats, m: Floats) -> None:
         here, frame, arm, body = part
-        loops.add_momenta(frame, arm, body, force[here], m)
+        loops.add_momenta(frame, arm, body, force[here], m, self._pushed)
         add_moments(self._turn[here], body, moment[here], m)
 
     def contact_blocks(self) -> Floats:
@@ -94,7 +93,7 @@ class TurningMap(ContactMap):
         """The map with its rows multiplied by ``size`` (2 nc, 3)."""
         rows = np.concatenate([self.given.frame, self._given_turn]).reshape(-1, 3, 3) * size[:, :, None]
         frame, turn = rows.reshape(2, -1, 9)
-        mass = self.mass.scaled(size, precision)
+        mass = self.mass.rounded(precision)
         other = TurningMap(self.comm, replace(self.given, frame=frame), turn, self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
         return other

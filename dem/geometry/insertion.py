@@ -27,26 +27,25 @@ def inserted(
     width = 2.0 * max(radius.max(), others.max(initial=0.0)) * (1.0 + 1e-9)
     cells = np.clip(np.floor(wide / width), 1, 128).astype(np.int64)
     spheres = np.concatenate([center, np.zeros((n, 3))]), np.concatenate([others, radius])
-    taken: Ints = _insert(place, free, *spheres, m, low, wide, cells, period)
+    taken: Ints = _insert(place, free, spheres, m, (low, wide, cells, period))
     return taken
 
 
 @loop
-def _insert(place, free, center, radius, known, low, wide, cells, period):
-    n = len(place)
+def _insert(place, free, spheres, known, grid):
+    (center, radius), cells, n = spheres, grid[2], len(place)
     first = np.full(cells[0] * cells[1] * cells[2], -1, np.int64)
     following, taken, at = np.full(known + n, -1, np.int64), np.full(n, -1, np.int64), np.zeros(3, np.int64)
     for k in range(known):
-        cell = _cell(center[k], low, wide, cells, period, at)
+        cell = _cell(center[k], grid, at)
         following[k] = first[cell]
         first[cell] = k
     for k in range(n):
         for t in range(place.shape[1]):
-            if free[k, t] and _fits(place[k, t], radius[known + k], first, following, center, radius, low, wide,
-                                    cells, period, at):  # fmt: skip
+            if free[k, t] and _fits(place[k, t], radius[known + k], spheres, (first, following), grid, at):
                 taken[k] = t
                 center[known + k] = place[k, t]
-                cell = _cell(place[k, t], low, wide, cells, period, at)
+                cell = _cell(place[k, t], grid, at)
                 following[known + k] = first[cell]
                 first[cell] = known + k
                 break
@@ -56,8 +55,9 @@ def _insert(place, free, center, radius, known, low, wide, cells, period):
 
 
 @loop
-def _cell(point, low, wide, cells, period, at):
+def _cell(point, grid, at):
     """The number of the cell of a point, and its numbers `at` (3,) per axis."""
+    low, wide, cells, period = grid
     for k in range(3):
         c = int(np.floor((point[k] - low[k]) / wide[k] * cells[k]))
         at[k] = c % cells[k] if np.isfinite(period[k]) else min(max(c, 0), cells[k] - 1)
@@ -65,9 +65,11 @@ def _cell(point, low, wide, cells, period, at):
 
 
 @loop
-def _fits(point, radius, first, following, center, radii, low, wide, cells, period, at):
-    """Whether a sphere at a point touches none of those in the cells about it."""
-    _cell(point, low, wide, cells, period, at)
+def _fits(point, radius, spheres, chains, grid, at):
+    """Whether a sphere at a point touches none of those in the cells about it: the first of each cell, and the one that
+    follows each."""
+    (center, radii), (first, following), (_, _, cells, period) = spheres, chains, grid
+    _cell(point, grid, at)
     a, b, c = at[0], at[1], at[2]
     for x in range(a - 1, a + 2):
         for y in range(b - 1, b + 2):

@@ -9,10 +9,10 @@ contact point to the centre of the grain (Love 1927, Weber 1966); so a contact o
 with a large body a single one. The momentum of the grains obeys d(rho u)/dt = rho g - div(stress + kinetic stress).
 """
 
+from dem.geometry.region import Block, Cylinder
 from dem.measures.coarse import Fields, fields
 from dem.measures.grains import Grains, bearing, per_grain, triangle_forces
 from dem.measures.profiles import Mixing, Profile, mean_position, mixing, profile
-from dem.measures.region import Block, Cylinder
 from dem.measures.sample import Sample
 from dem.measures.tensors import fabric, kinetic_stress, solid_fraction, stress
 

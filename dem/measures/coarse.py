@@ -10,8 +10,8 @@ import numpy as np
 from dem.arrays import Floats
 from dem.checks import positive
 from dem.compiled import loop
+from dem.geometry.region import Block
 from dem.measures.grains import branches, ends
-from dem.measures.region import Block
 from dem.measures.sample import Sample, summed
 
 #: The functions W of `fields`.

@@ -8,6 +8,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
+from dem.compiled import loop
 from dem.measures.images import about, images
 from dem.measures.sample import Sample, summed
 from dem.mesh import Mesh, Surface
@@ -15,32 +16,47 @@ from dem.mesh import Mesh, Surface
 
 class Ends(NamedTuple):
     """The ends of contacts at grains: number of the grain (m,), its centre, the contact point, the force on it (m, 3),
-    the contact's row (m,), and the moment on it beside that of the force (m, 3), or 0."""
+    and the contact's row (m,)."""
 
     grain: Ints
     center: Floats
     point: Floats
     force: Floats
     contact: Ints
-    couple: Floats | float
 
 
 def ends(sample: Sample) -> Ends:
     """The ends of this rank's contacts at grains; not collective."""
-    row, side = np.nonzero(sample.bodies < sample.count)
-    sign = np.where(side == 1, 1.0, -1.0)[:, None]
-    couple = 0.0 if sample.moment is None else sign * sample.moment[row]
-    force = sign * sample.force[row]
-    return Ends(sample.bodies[row, side], sample.center[row, side], sample.point[row], force, row, couple)
+    return Ends(*_ends(sample.bodies, sample.count, sample.center, sample.point, sample.force))
+
+
+@loop
+def _ends(bodies, grains, center, point, force):
+    """The columns of `Ends`."""
+    count = 0
+    for c in range(len(bodies)):
+        count += (bodies[c, 0] < grains) + (bodies[c, 1] < grains)
+    grain, contact = np.empty(count, np.int64), np.empty(count, np.int64)
+    middle, place, pressed = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 3))
+    to = 0
+    for c in range(len(bodies)):
+        for side in range(2):
+            if bodies[c, side] < grains:
+                grain[to], contact[to] = bodies[c, side], c
+                for k in range(3):
+                    middle[to, k], place[to, k] = center[c, side, k], point[c, k]
+                    pressed[to, k] = force[c, k] if side else -force[c, k]
+                to += 1
+    return grain, middle, place, pressed, contact
 
 
 def branches(sample: Sample, end: Ends, low: Floats, high: Floats, reach: float = 0.0) -> tuple[Ints, Floats, Floats]:
     """Rows (m,) of the ends of contacts and of their images, their points (m, 3) and the ways from there to the centres
     (m, 3); of all that may come within `reach` of the box from `low` to `high` (3,) [m]."""
     branch = end.center - end.point
-    longest = float(np.abs(branch).max(initial=0.0))
+    longest = max(float(branch.max(initial=0.0)), -float(branch.min(initial=0.0)))
     row, step = images(end.point, sample.lattice, low, high, reach + longest)
-    return row, end.point[row] + step @ sample.lattice, branch[row]
+    return row, end.point.take(row, axis=0) + step @ sample.lattice, branch.take(row, axis=0)
 
 
 def bearing(sample: Sample) -> Bools:
@@ -63,15 +79,39 @@ class Grains(NamedTuple):
 
 def per_grain(sample: Sample) -> Grains:
     """Contact force, torque, stress times volume, and coordination number of every grain."""
-    end = ends(sample)
-    arm = end.point - end.center
-    moment = -end.force[:, :, None] * arm[:, None, :]
-    torque = np.cross(arm, end.force) + end.couple
-    columns = [end.force, torque, moment.reshape(-1, 9), bearing(sample)[end.contact, None]]
-    table = np.zeros((sample.count, 16))
-    np.add.at(table, end.grain, np.concatenate(columns, axis=1))
+    table, moment = np.zeros((sample.count, 16)), np.zeros((0, 3)) if sample.moment is None else sample.moment
+    _add(sample.bodies, sample.center, sample.point, sample.force, moment, bearing(sample), table)
     table = summed(sample, table)
     return Grains(table[:, :3], table[:, 3:6], table[:, 6:15].reshape(-1, 3, 3), np.rint(table[:, 15]).astype(np.int64))
+
+
+@loop
+def _add(bodies, center, point, force, moment, bears, table):
+    """table (count, 16) += the columns of `Grains` of contacts, where ``moment`` may be empty."""
+    for c in range(len(bodies)):
+        for side in range(2):
+            n = bodies[c, side]
+            if n < len(table):
+                sign = 1.0 if side else -1.0
+                x, y, z = sign * force[c, 0], sign * force[c, 1], sign * force[c, 2]
+                r = point[c, 0] - center[c, side, 0]
+                s = point[c, 1] - center[c, side, 1]
+                t = point[c, 2] - center[c, side, 2]
+                row = table[n]
+                row[0] += x
+                row[1] += y
+                row[2] += z
+                row[3] += s * z - t * y
+                row[4] += t * x - r * z
+                row[5] += r * y - s * x
+                if len(moment):
+                    for k in range(3):
+                        row[3 + k] += sign * moment[c, k]
+                for k, f in enumerate((x, y, z)):
+                    row[6 + 3 * k] -= f * r
+                    row[7 + 3 * k] -= f * s
+                    row[8 + 3 * k] -= f * t
+                row[15] += bears[c]
 
 
 def triangle_forces(sample: Sample, body: int, mesh: Mesh, position: Floats, turn: Floats) -> Floats:

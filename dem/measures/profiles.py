@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dem.arrays import ArrayLike, Bools, Floats
-from dem.measures.region import Block
+from dem.geometry.region import Block
 from dem.measures.sample import Sample, summed
 
 

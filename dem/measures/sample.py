@@ -68,5 +68,7 @@ class Sample:
 
 
 def summed(sample: Sample, values: Any) -> Any:
-    """The sum over the ranks."""
-    return sample.comm.allreduce(values)
+    """The sum over the ranks of a number or an array."""
+    out = np.array(values)
+    sample.comm.Allreduce(MPI.IN_PLACE, out)
+    return out[()]

@@ -8,9 +8,9 @@ from dem.arrays import Bools, Floats
 from dem.bodies import SPHERE
 from dem.checks import positive
 from dem.compiled import loop
+from dem.geometry.region import Block, Cylinder, Region
 from dem.measures.grains import bearing, branches, ends
 from dem.measures.images import images
-from dem.measures.region import Block, Cylinder, Region
 from dem.measures.sample import Sample, summed
 
 
@@ -21,11 +21,11 @@ def stress(sample: Sample, region: Region | Bools, volume: float | None = None) 
     end = ends(sample)
     if isinstance(region, (Block, Cylinder)):
         row, point, branch = branches(sample, end, *region.bounds)
-        part, force, volume = region.part(point, point + branch), end.force[row], region.volume
+        part, force, volume = region.part(point, point + branch), end.force.take(row, axis=0), region.volume
     else:
         part, force, branch = _everywhere(sample, region)[end.grain], end.force, end.center - end.point
         volume = _volume(volume)
-    return summed(sample, np.einsum("e,ea,eb->ab", part, force, branch)) / volume
+    return summed(sample, (part[:, None] * force).T @ branch) / volume
 
 
 def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None = None) -> Floats:

@@ -38,7 +38,9 @@ def change(world: World, what: str, **values: Any) -> None:
     refuse_functions(what, values)
     if kind == "cell":
         _refuse_others(what, values, world.cell.CHANGED)
-        world.cell = world.cell.changed(world.time, **values)
+        then, grains = world.cell, world.grains
+        world.cell = then.changed(world.time, **values)
+        grains.velocity = world.cell.taken_along(then, grains.position, grains.velocity)
     elif kind == "body":
         _change_body(world, name, **values)
     else:
@@ -90,23 +92,24 @@ def _change_body(world: World, name: str, motion: Motion | None = None, **values
         motion = motions.changed(body.motion, world.time, **values) if motion is None else motion
         pose = body.position, body.quaternion
         motions.refuse_ignored(motion)
-        _refuse_other_ways(body, motion)
+        _refuse_other_freedoms(body, motion)
         if not isinstance(motion, Dynamic):
             pose = _leading_to(motion, world.time, world.large.position[row], world.large.quaternion[row])
         body = dataclasses.replace(body, motion=motion, position=pose[0], quaternion=pose[1])
     world.replace_large(body)
 
 
-def _refuse_other_ways(body: LargeBody, motion: Motion) -> None:
+def _refuse_other_freedoms(body: LargeBody, motion: Motion) -> None:
     """ValueError for a motion by which forces would move a body in other ways than by its own, or would begin to."""
     if not (isinstance(body.motion, Dynamic) or isinstance(motion, Dynamic)):
         return
-    if type(motion) is not type(body.motion) or not np.allclose(_ways(motion), _ways(body.motion), atol=1e-12):
+    alike = type(motion) is type(body.motion)
+    if not (alike and np.allclose(_free_projectors(motion), _free_projectors(body.motion), atol=1e-12)):
         kind = f"{type(body.motion).__name__} with another drive" if isinstance(body.motion, Dynamic) else "a path"
         raise ValueError(f"body {body.name!r} cannot change its motion to {motion!r}: allowed is {kind}")
 
 
-def _ways(motion: Any) -> Floats:
+def _free_projectors(motion: Any) -> Floats:
     """Projectors (2, 3, 3) on what forces and torques can move."""
     return np.array([motion.free_directions(), motion.free_turns()])
 
@@ -171,7 +174,7 @@ def _restored(body: LargeBody, entry: Mapping[str, Any]) -> LargeBody:
     if strange := sorted({*entry["values"]} - {field.name for field in dataclasses.fields(kind)}):
         raise ValueError(f"body {name!r}: its motion {kind.__name__} has no {strange[0]}")
     motion = kind(**entry["values"])
-    _refuse_other_ways(body, motion)
+    _refuse_other_freedoms(body, motion)
     place = checks.vector(f"position of {name!r}", entry["position"])
     turn = checks.rows(f"quaternion of {name!r}", entry["quaternion"], 1, 4)[0]
     if abs(np.linalg.norm(turn) - 1.0) > 1e-6:

@@ -11,20 +11,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dem import bodies, quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.exchange import greatest, on_any
-from dem.model.neighbourhood import Neighbourhood, chunk_boxes, touched
-from dem.model.world import World
+from dem.model.neighbourhood import Neighbourhood, chunk_boxes, seen_by
 from dem.parts.cell import Cell
 from dem.shapes import Plane, placed
 from dem.together import SceneError
 
+if TYPE_CHECKING:
+    from dem.model.world import World
 
-def put_back(world: World) -> None:
+
+def wrap(world: World) -> None:
     """Put all grains back into the cell if one is too far outside; collective. SceneError for large bodies that the
     cell does not allow now."""
     cell = world.cell
@@ -138,13 +141,11 @@ def images(world: World, near: Neighbourhood) -> Images:
     own = chunk_boxes(position[: near.grains], radius[: near.grains], 8)
     large = _boxes(world)
     steps, across = cell.images()
-    found = [np.zeros(0, np.int64)]  # of the bodies themselves
-    for way in cell.ways[1:]:
-        rows = touched(position + way, radius, own[None])[0]
-        if len(large):
-            of_large = touched(position[: near.grains] + way, radius[: near.grains], large[None])[0]
-            rows = np.union1d(rows, of_large)
-        found.append(rows)
-    which = np.repeat(np.arange(len(steps)), [len(rows) for rows in found])
-    source, steps, across = np.concatenate(found), steps[which], across[which]
+    seen = seen_by(position, radius, cell.image_vectors, own[None])[0]
+    if len(large):
+        of_grains = position[: near.grains], radius[: near.grains]
+        seen[:, : near.grains] |= seen_by(*of_grains, cell.image_vectors, large[None])[0]
+    seen[0] = False  # the bodies themselves
+    which, source = seen.nonzero()
+    steps, across = steps[which], across[which]
     return Images(source, steps, across, cell.moved(steps, across), count)

@@ -6,16 +6,19 @@ A contact belongs to the rank of the lower global body index: ghosts only travel
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dem import bodies
-from dem.arrays import Floats, Ints
+from dem.arrays import Bools, Floats, Ints
 from dem.bodies import Bodies
+from dem.compiled import inlined, loop
 from dem.contact_map.halo import Halo
 from dem.exchange import exchange
-from dem.model.world import World
+
+if TYPE_CHECKING:
+    from dem.model.world import World
 
 
 @dataclass(frozen=True)
@@ -47,9 +50,7 @@ def neighbourhood(world: World, margin: Floats) -> Neighbourhood:
         )
     mine, large = world.slabs[comm.rank] + np.arange(len(grains)), world.slabs[-1] + np.arange(len(world.large))
     columns = dict(grains.columns(), margin=margin, index=mine)
-    seen = [touched(grains.position + way, radius, boxes[: comm.rank]) for way in world.cell.ways]
-    row, rank = np.concatenate(seen, axis=1)
-    rank, row = np.divmod(np.unique(rank * len(grains) + row), max(len(grains), 1))
+    rank, row = seen_by(grains.position, radius, world.cell.image_vectors, boxes[: comm.rank]).any(axis=1).nonzero()
     ghosts = exchange(comm, {name: column[row] for name, column in columns.items()}, rank)
     index, ghost_margin = ghosts.pop("index"), ghosts.pop("margin")
     return Neighbourhood(
@@ -93,16 +94,28 @@ def chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:
     return boxes
 
 
-def touched(position: Floats, radius: Floats, boxes: Floats) -> tuple[Ints, Ints]:
-    """Pairs (row, rank) of the balls that touch a box of a rank; boxes (ranks, k, 2, 3)."""
-    rows, ranks = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    if len(position) and len(boxes):
-        low, high = (position - radius[:, None]).min(axis=0), (position + radius[:, None]).max(axis=0)
-        meets = ((boxes[:, :, 0] <= high) & (boxes[:, :, 1] >= low)).all(axis=2)
-        for rank in np.flatnonzero(meets.any(axis=1)):
-            near = boxes[rank, meets[rank]]
-            outside = np.maximum(near[:, 0] - position[:, None], position[:, None] - near[:, 1]).max(axis=2)
-            row = np.flatnonzero((outside <= radius[:, None]).any(axis=1))
-            rows.append(row)
-            ranks.append(np.full(len(row), rank))
-    return np.concatenate(rows), np.concatenate(ranks)
+@loop
+def seen_by(position: Floats, radius: Floats, ways: Floats, boxes: Floats) -> Bools:
+    """Whether balls (n,), moved by these ways (w, 3), touch a box of a rank (ranks, w, n); boxes (ranks, k, 2, 3)."""
+    out = np.zeros((len(boxes), len(ways), len(radius)), np.bool_)
+    for rank in range(len(boxes)):
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)  # about all of them
+        for box in boxes[rank]:
+            for k in range(3):
+                low[k], high[k] = min(low[k], box[0, k]), max(high[k], box[1, k])
+        for w in range(len(ways)):
+            for n in range(len(radius)):
+                x, y, z = position[n, 0] + ways[w, 0], position[n, 1] + ways[w, 1], position[n, 2] + ways[w, 2]
+                if _outside(x, y, z, low, high) <= radius[n]:
+                    for box in boxes[rank]:
+                        if _outside(x, y, z, box[0], box[1]) <= radius[n]:
+                            out[rank, w, n] = True
+                            break
+    return out
+
+
+@inlined
+def _outside(x, y, z, low, high):
+    """How far a point is from a box along the axis where that is the most; negative inside."""
+    along_z = max(low[2] - z, z - high[2])
+    return max(max(low[0] - x, x - high[0]), max(low[1] - y, y - high[1]), along_z)

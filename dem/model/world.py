@@ -98,7 +98,7 @@ class World:
     @property
     def ids(self) -> int:
         """Number of grains that there have been; their ids are less."""
-        return self.initial + self.passages.came
+        return self.initial + self.passages.inserted_count
 
     def __repr__(self) -> str:
         return f"<World: {self.body_count} bodies, {len(self.grains)} grains of this rank, time {self.time:g} s>"

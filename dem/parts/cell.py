@@ -109,10 +109,18 @@ class Cell(Named):
         return number + (place - length * number >= length)  # a negative number that rounding makes a period
 
     def leaves(self, position: Floats) -> bool:
-        """Whether one of the positions (n, 3) is further outside than a quarter of a period. In a sheared cell that
-        changes its size none may be outside: where the length along the gradient changes, so does its velocity."""
-        far = 0.0 if self.deforms and self.gradient is not None else 0.25
-        return bool(((np.maximum(-position, position - self.period) > far * self.period) & self.axes).any())
+        """Whether one of the positions (n, 3) is further outside than a quarter of a period."""
+        return bool(((np.maximum(-position, position - self.period) > 0.25 * self.period) & self.axes).any())
+
+    def taken_along(self, then: Cell, position: Floats, velocity: Floats) -> Floats:
+        """Velocities (n, 6) of bodies that had them at these positions (n, 3) in the cell `then`: behind a sheared
+        boundary they go with the images there, whose speed changes with the shear rate and the period."""
+        faster = self.speed - then.speed
+        if not faster or not (crossed := then._crossed(position)).any():
+            return velocity
+        out = velocity.copy()
+        out[:, 0] += faster * crossed
+        return out
 
     def whole(self, way: Floats) -> Floats:
         """The part (..., 3) of ways (..., 3) that is whole periods [m]; without it, ways lead to the nearest image."""
@@ -135,7 +143,7 @@ class Cell(Named):
         return steps, across
 
     @property
-    def ways(self) -> Floats:
+    def image_vectors(self) -> Floats:
         """The ways (k, 3) of `images` [m]."""
         return self.moved(*self.images())
 
@@ -162,17 +170,15 @@ class Cell(Named):
         if not self.moves:
             return self
         stretch = 1.0 + dt * self.rate
-        return replace(self, period=self.period * stretch, shift=(self.shift + dt * self.speed) * float(stretch[0]))
+        return replace(self, period=self.period * stretch, shift=self.shift * float(stretch[0]) + dt * self.speed)
 
     def before(self, dt: float) -> Cell:
         """The cell at the start of the step of dt [s] that has led to this one."""
         if not self.moves:
             return self
         stretch = 1.0 + dt * self.rate
-        period, shift = self.period / stretch, self.shift / float(stretch[0])
-        if self.gradient is not None:
-            shift -= dt * self.shear_rate * float(period[self.gradient])
-        return replace(self, period=period, shift=shift)
+        then = replace(self, period=self.period / stretch)
+        return replace(then, shift=(self.shift - dt * then.speed) / float(stretch[0]))
 
     def beside_flow(self, position: Floats, velocity: Floats) -> Floats:
         """Linear velocities (n, 3) beside those of the shear at these positions (n, 3) [m/s]."""
@@ -191,7 +197,7 @@ class Cell(Named):
         reach = 3.0 * bodies.bounding_radius(grains)  # with a margin of two radii, the greatest of `dem.contact`
         return sheared + dt * np.abs(self.rate).max() * reach
 
-    def gone_since(self, then: Cell) -> float:
+    def image_travel(self, then: Cell) -> float:
         """What two grains of a pair have each of the way by which images have moved since `then` [m]."""
         if not self.moves:
             return 0.0
@@ -199,7 +205,7 @@ class Cell(Named):
         most = 2.0 + abs(then.shift) / then.period[0]  # periods along x in the ways of images of a sheared cell
         return 0.5 * (abs(self.shift - then.shift) + float(growth @ (most, 1.0, 1.0)))
 
-    def given_at(self, time: float, dt: float) -> Floats:
+    def given_rates(self, time: float, dt: float) -> Floats:
         """Rates (3,) at which the periods are to grow in the step of dt [s] from the `time` [s]; NaN: what the asked
         stress needs, or none [1/s]."""
         return -self.strain_rate if time >= self.start - 1e-6 * dt else np.full(3, np.nan)

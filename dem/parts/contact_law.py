@@ -11,7 +11,7 @@ import numpy as np
 
 from dem import checks
 from dem.arrays import Floats
-from dem.parts.laws import Law, Met, Solved
+from dem.parts.laws import ContactState, Law, Solved
 from dem.parts.laws.bridges import Bridges
 from dem.parts.laws.cohesion import Cohesion
 from dem.parts.laws.rolling import Rolling
@@ -55,7 +55,7 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
     @property
     def resists(self) -> bool:
         """Whether contacts of any pair resist rolling or spinning."""
-        return self.moments() is not None
+        return any(law.RESISTS for law in self.acting)
 
     @cached_property
     def attracts(self) -> bool:
@@ -68,20 +68,20 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
     def strongest(self, radius: Floats) -> Any:
         return sum(law.strongest(self, radius) for law in self.acting)
 
-    def pull(self, met: Met, kept: Floats) -> Floats | None:
-        found = [law.pull(self, met, column) for law, column in self._each(kept)]
+    def attraction(self, met: ContactState, kept: Floats) -> Floats | None:
+        found = [law.attraction(self, met, column) for law, column in self._each(kept)]
         pulls = [pull for pull in found if pull is not None]
         return np.sum(pulls, axis=0) if pulls else None
 
-    def cone(self, met: Met, kept: Floats, friction: Floats) -> Floats:
+    def cone(self, met: ContactState, kept: Floats, friction: Floats) -> Floats:
         for law, column in self._each(kept):
             friction = law.cone(self, met, column, friction)
         return friction
 
-    def moments(self) -> tuple[Floats, Floats] | None:
-        return next((found for law in self.acting if (found := law.moments(self)) is not None), None)
+    def moments(self, met: ContactState) -> tuple[Floats, Floats] | None:
+        return next((found for law in self.acting if (found := law.moments(self, met)) is not None), None)
 
-    def keep(self, met: Met, kept: Floats, solved: Solved) -> Floats:
+    def keep(self, met: ContactState, kept: Floats, solved: Solved) -> Floats:
         found = [law.keep(self, met, column, solved) for law, column in self._each(kept) if law.KEEPS]
         return np.stack(found, axis=1) if found else kept
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Union
+from typing import TYPE_CHECKING, Any, NamedTuple, Union
 
 import numpy as np
 
 from dem import checks
 from dem.arrays import Floats, Ints
-from dem.parts.cell import Cell
 from dem.parts.named import Named
 from dem.quaternion import cross
+
+if TYPE_CHECKING:
+    from dem.parts.cell import Cell
 
 HELD, MOTOR, LOWER, UPPER = range(4)  #: kinds of conditions: what is held, a motor, limits
 

@@ -8,16 +8,18 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from dem import checks, quaternion
 from dem.arrays import Floats, Ints
 from dem.motion import Driven
-from dem.parts.cell import Cell
 from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Condition, Constraint, End, Geometry, Place
 from dem.parts.named import Pressing
+
+if TYPE_CHECKING:
+    from dem.parts.cell import Cell
 
 
 def axes_of(frame: Floats) -> Floats:
@@ -152,7 +154,7 @@ class Joint(Constraint):
         return self.speed is not None or self.target is not None
 
     @property
-    def way(self) -> int:
+    def coordinate(self) -> int:
         """The number of its free coordinate among three translations and three turns: that of motors and limits."""
         return KINDS[self.kind].way
 
@@ -165,14 +167,14 @@ class Joint(Constraint):
         return dataclasses.replace(self, **values)
 
     def conditions(self, error: Floats, dt: float) -> list[Condition]:
-        at = error[self.way]
+        at = error[self.coordinate]
         found = [Condition(way, HELD, -error[way] / dt) for way in np.flatnonzero(KINDS[self.kind].holds).tolist()]
         if self.driven:
             speed = self.speed if self.target is None else (self.target - at) / dt
             speed = min(max(speed, (self.low - at) / dt), (self.high - at) / dt)  # it stops at its limits
-            found.append(Condition(self.way, MOTOR, speed, self.strength * dt))
+            found.append(Condition(self.coordinate, MOTOR, speed, self.strength * dt))
         limits = (LOWER, self.low), (UPPER, self.high)
-        return found + [Condition(self.way, kind, (end - at) / dt) for kind, end in limits if np.isfinite(end)]
+        return found + [Condition(self.coordinate, kind, (end - at) / dt) for kind, end in limits if np.isfinite(end)]
 
     @classmethod
     def geometry(cls, members: Sequence[Any], row: Ints, cell: Cell) -> Place:

@@ -128,4 +128,4 @@ class Load(Force, Timed):
                 out[:, part] = checks.rows(f"the {name} that a load returns", value(time, table), len(table), 3)
             else:
                 out[:, part] = value if value.ndim == 1 else value[place]
-        return (self.gone(time + dt) - self.gone(time)) * out
+        return (self.elapsed(time + dt) - self.elapsed(time)) * out

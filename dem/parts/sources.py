@@ -15,7 +15,7 @@ import numpy as np
 from dem import checks, quaternion, shapes
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import SPHERE, Bodies, concatenate, enclosing_radius, none
-from dem.measures import Block, Cylinder
+from dem.geometry.region import Block, Cylinder
 from dem.motion import Timed
 from dem.parts.named import Named
 from dem.shapes import Box, Capsule
@@ -167,7 +167,7 @@ class Source(Named, Timed):
         """What is due by the time [s]: mass [kg], or number of grains."""
         rate = self.number_rate if self.mass_rate is None else self.mass_rate
         assert rate is not None
-        return self.before + rate * self.gone(time)
+        return self.before + rate * self.elapsed(time)
 
     def changed(self, time: float, tally: Tally, **values: Any) -> Source:
         """The same with another `mass_rate`, `number_rate` or `velocity` from the time [s] on. What was due before and
@@ -218,7 +218,7 @@ class Tally:
 class Passages:
     """The sources and outlets of a scene by name, and what has passed each of them up to now.
 
-    What comes and goes in a step is found by `dem.record.passage.come_and_go`; the rest asks these methods alone.
+    What comes and goes in a step is found by `dem.record.passage.insert_and_remove`; the rest asks these methods alone.
     """
 
     sources: dict[str, Source] = field(default_factory=dict)
@@ -247,12 +247,12 @@ class Passages:
         return Passages(self.sources, self.outlets, tallies)
 
     @property
-    def came(self) -> int:
+    def inserted_count(self) -> int:
         """Number of grains that have come."""
         return sum(self.tallies[name].count for name in self.sources)
 
     @property
-    def left(self) -> int:
+    def removed_count(self) -> int:
         """Number of grains that have left."""
         return sum(self.tallies[name].count for name in self.outlets)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -16,14 +16,17 @@ from dem import bodies
 from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import COMPOUND, Bodies
 from dem.compiled import loop
-from dem.exchange import reduced, told
+from dem.exchange import broadcast, reduced
 from dem.experiment import Experiment
 from dem.motion import Held
+from dem.record.energies import energy
 from dem.start import stiffness
-from dem.step import Step
 from dem.step.servo import cell_stress
 from dem.together import SceneError, digest, together
 from dem.unconstrained.constraints import slots
+
+if TYPE_CHECKING:
+    from dem.step import Step
 
 
 def row(step: Step, scene: Experiment) -> dict[str, float]:
@@ -74,11 +77,11 @@ def cell(step: Step) -> dict[str, float]:
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
     place = step.world.cell.wrapped(step.world.grains.position)
-    return step.total(outside_of(place, np.asarray(low, float), np.asarray(high, float)))
+    return step.total(count_outside(place, np.asarray(low, float), np.asarray(high, float)))
 
 
 @loop
-def outside_of(place: Floats, low: Floats, high: Floats) -> int:
+def count_outside(place: Floats, low: Floats, high: Floats) -> int:
     """How many places (n, 3) are outside the box from `low` to `high` (3,)."""
     lost = 0
     for n in range(len(place)):
@@ -93,35 +96,6 @@ CREATED, SUDDEN = 0.1, 10.0
 SLOW = 0.1  #: a body is at rest below this part of the speed that a step of free fall gives
 CREEP = 1e-6  #: or below this part of its radius in a step
 SUNK = 1e-3  #: a rise of the energy is none if bodies would get it by sinking for this part of their radii
-
-
-def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
-    """Kinetic and potential energy [J] of the bodies of a table that forces can move; the potential energy is zero at
-    the origin."""
-    kinetic, moment = energies(table.position, table.quaternion, table.velocity, table.mass, table.inertia)
-    return kinetic, float(-(moment @ gravity))
-
-
-@loop
-def energies(position: Floats, turn: Floats, velocity: Floats, mass: Floats, inertia: Floats) -> tuple[float, Floats]:
-    """The kinetic energy [J] of n bodies with principal moments (n, 3), and the sum of mass times position (3,)
-    [kg m]. An infinite mass or moment does not move."""
-    kinetic, moment = 0.0, np.zeros(3)
-    for n in range(len(mass)):
-        if np.isfinite(mass[n]):
-            for k in range(3):
-                kinetic += 0.5 * mass[n] * velocity[n, k] ** 2
-                moment[k] += mass[n] * position[n, k]
-            w, x, y, z = turn[n, 0], -turn[n, 1], -turn[n, 2], -turn[n, 3]
-            a, b, c = velocity[n, 3], velocity[n, 4], velocity[n, 5]
-            p, q, r = y * c - z * b, z * a - x * c, x * b - y * a  # to the frame of the body
-            spin = (
-                a + 2.0 * (w * p + y * r - z * q), b + 2.0 * (w * q + z * p - x * r), c + 2.0 * (w * r + x * q - y * p)
-            )  # fmt: skip
-            for k in range(3):
-                if np.isfinite(inertia[n, k]):
-                    kinetic += 0.5 * inertia[n, k] * spin[k] ** 2
-    return kinetic, moment
 
 
 def energy_balance(step: Step) -> dict[str, float]:
@@ -198,7 +172,7 @@ def energy_balance(step: Step) -> dict[str, float]:
         "impact_loss [J]": 0.0 - whole["normal"] - held,
         **({} if system.attraction is None else {"work_of_cohesion [J]": whole["attracted"]}),
         "time_stepping [J]": made,
-        "energy_jump [J]": told(comm, rise if jumps else 0.0),  # what follows from it must not differ between ranks
+        "energy_jump [J]": broadcast(comm, rise if jumps else 0.0),  # what follows from it is the same on all ranks
     }
 
 

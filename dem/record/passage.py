@@ -13,24 +13,24 @@ from dem.arrays import Bools, Floats
 from dem.bodies import PLANE, SPHERE, Bodies
 from dem.contact.primitives import primitives, touches
 from dem.geometry.insertion import inserted
-from dem.model.neighbourhood import Neighbourhood, touched
+from dem.model.neighbourhood import Neighbourhood, seen_by
 from dem.model.partition import redistribute
 from dem.model.world import World
 from dem.parts.sources import MOST_IDS, Source, bounds, reach
-from dem.record import energy
+from dem.record.energies import energy
 from dem.together import SceneError
 
 PART = 256  #: grains that are placed at once
 
 
-def come_and_go(world: World) -> None:
+def insert_and_remove(world: World) -> None:
     """Let grains leave and come, as they are due at the time of the world; collective. SceneError for a source that has
     used up all ids."""
     world.passages = world.passages.counted()
     if world.passages.outlets:
         _leave(world)
     if world.passages.sources:
-        _come(world)
+        _insert(world)
 
 
 def _leave(world: World) -> None:
@@ -50,7 +50,7 @@ def _leave(world: World) -> None:
         world.set_grains(grains.take(~left))
 
 
-def _come(world: World) -> None:
+def _insert(world: World) -> None:
     comm, ids = world.comm, world.ids
     wanted = comm.bcast([name for name in world.passages.sources if _due(world, name, PART)[1]])
     for name in world.passages.sources:
@@ -61,7 +61,7 @@ def _come(world: World) -> None:
     born: list[Bodies] = []
     if comm.rank == 0:
         for name in wanted:
-            found, center, radius = _born(world, name, center, radius)
+            found, center, radius = _inserted(world, name, center, radius)
             born += found
     tallies, count = comm.bcast(({name: world.passages.tallies[name] for name in wanted}, sum(map(len, born))))
     world.passages.tallies.update(tallies)
@@ -91,8 +91,7 @@ def _about(world: World, sources: list[Source]) -> tuple[Floats, Floats]:
     largest = np.array([reach(source.extremes()).max() for source in sources])
     boxes += np.array([-1.0, 1.0])[None, :, None] * largest[:, None, None]
     position, radius = world.cell.wrapped(world.grains.position), reach(world.grains)
-    found = [touched(position + way, radius, boxes[None])[0] for way in world.cell.ways]
-    rows = np.unique(np.concatenate(found)).astype(np.int64)
+    rows = seen_by(position, radius, world.cell.image_vectors, boxes[None])[0].any(axis=0).nonzero()[0]
     parts = world.comm.gather((world.grains.id[rows], position[rows], radius[rows]))
     if parts is None:
         return np.zeros((0, 3)), np.zeros(0)
@@ -101,7 +100,7 @@ def _about(world: World, sources: list[Source]) -> tuple[Floats, Floats]:
     return center[order], radii[order]
 
 
-def _born(world: World, name: str, center: Floats, radius: Floats) -> tuple[list[Bodies], Floats, Floats]:
+def _inserted(world: World, name: str, center: Floats, radius: Floats) -> tuple[list[Bodies], Floats, Floats]:
     """The grains that a source adds now among spheres of centres (m, 3) and radii (m,), and all of these spheres then;
     counted in the tally. Where the next grain finds no place, it and all after it wait, so that sizes keep their
     shares."""
@@ -130,7 +129,7 @@ def _free(world: World, place: Floats, radius: Floats) -> Bools:
     free = np.ones(place.shape[:2], bool)
     if not len(world.large) or not free.size:
         return free
-    for way in world.cell.ways:
+    for way in world.cell.image_vectors:
         free &= _apart(world, place.reshape(-1, 3) + way, np.repeat(radius, place.shape[1])).reshape(free.shape)
     return free
 

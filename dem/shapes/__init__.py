@@ -168,16 +168,6 @@ def mass_properties(shapes: Sequence[Shape], density: float) -> tuple[float, Flo
     return float(total), center, tensors.sum(axis=0) + steiner
 
 
-def principal(tensor: Floats) -> tuple[Floats, Floats]:
-    """Principal moments (3,) and axes, as a quaternion (4,), of an inertia tensor (3, 3); where it is diagonal the axes
-    stay."""
-    moments, axes = np.diag(tensor).copy(), np.eye(3)
-    if np.abs(tensor - np.diag(moments)).max() > 1e-12 * moments.max():
-        moments, axes = np.linalg.eigh(tensor)
-        axes[:, 2] *= np.linalg.det(axes)  # right-handed
-    return moments, quaternion.from_matrix(axes)
-
-
 def moved(shape: Shape, center: Floats, turn: Floats) -> Shape:
     """The shape in a frame with origin `center` (3,) and orientation `turn` (4,) in the present one."""
     back = quaternion.conjugate(turn)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -18,8 +18,10 @@ from dem import quaternion
 from dem.arrays import Floats
 from dem.bodies import CLUMP
 from dem.compiled import loop
-from dem.shapes import Clump, principal
 from dem.shapes.forms import Form
+
+if TYPE_CHECKING:
+    from dem.shapes import Clump
 
 CELLS = 1000
 
@@ -44,13 +46,18 @@ class ClumpForm(Form):
         return {"centres": self.center.tolist(), "radii": self.radius.tolist()}
 
 
+def arm(form: Form) -> float:
+    """How far the centre of a sphere of a clump is from that of the clump, at most; 0 of other forms [m]."""
+    return float(np.linalg.norm(form.center, axis=1).max()) if isinstance(form, ClumpForm) else 0.0
+
+
 @cache
 def form(shape: Clump) -> ClumpForm:
     """The form of a clump; the same object for equal clumps."""
     center, radius = np.array(shape.centres), np.array(shape.radii)
     middle = center.mean(axis=0)
     volume, place, tensor = union(center - middle, radius)
-    moments, turn = principal(tensor)
+    moments, turn = quaternion.principal(tensor)
     place = place + middle
     own = quaternion.rotate(quaternion.conjugate(turn), center - place)
     return ClumpForm(volume, moments, place, turn, own, radius)

@@ -14,7 +14,6 @@ from dem import quaternion
 from dem.arrays import ArrayLike, Floats, Ints
 from dem.bodies import POLYHEDRON
 from dem.checks import finite
-from dem.shapes import principal
 from dem.shapes.forms import Form
 
 #: Vertices of a polyhedron: contacts are known by pairs of edges, and the search tries all of them.
@@ -69,7 +68,7 @@ def _solid(vertices: tuple[tuple[float, ...], ...]) -> Solid:
     middle = given.mean(axis=0)
     faces = hull(given - middle)
     volume, place, tensor = integrals(faces)
-    moments, turn = principal(tensor)
+    moments, turn = quaternion.principal(tensor)
     back = quaternion.conjugate(turn)
     own = quaternion.rotate(back, faces.vertex - place), quaternion.rotate(back, faces.normal)
     return Solid(volume, moments, place + middle, turn, Faces(*own, *faces[2:]))

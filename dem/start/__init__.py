@@ -16,7 +16,7 @@ from dem.bodies import Bodies
 from dem.contact import find_contacts
 from dem.contact.primitives import refuse_untouchable
 from dem.exchange import exchange, refuse
-from dem.model.images import put_back
+from dem.model.images import wrap
 from dem.model.partition import redistribute
 from dem.model.world import World
 from dem.parts.ends import Tie
@@ -38,7 +38,7 @@ def new_world(scene: Scene, comm: MPI.Comm, overlap: float = 0.01) -> World:
     rows = even_slice(scene.count, comm)
     world = _world(scene, comm, scene.cell.inside(scene.grains(rows.start, rows.stop)))
     world.put_large(world.poses(0.0))
-    put_back(world)
+    wrap(world)
     redistribute(world)
     refuse_overlap(world, overlap)
     return world
@@ -65,7 +65,7 @@ def restored_world(
     for part in ("passages", "cell"):
         restored = partial(getattr(world, part).restored, replicated)
         setattr(world, part, together(comm, f"restored {part}", restored, own=(ValueError,)))
-    count = world.ids - world.passages.left
+    count = world.ids - world.passages.removed_count
     if world.slabs[-1] != count or len(large["id"]) != len(world.large):
         raise ValueError(
             f"the state has {world.slabs[-1]} grains and {len(large['id'])} large bodies, "
@@ -109,7 +109,7 @@ def _refuse_impossible(world: World) -> None:
     owner = np.clip(np.searchsorted(starts, world.grains.id, side="right") - 1, 0, world.comm.size - 1)
     ids = np.sort(exchange(world.comm, {"id": world.grains.id}, owner)["id"])
     most = starts[world.comm.rank : world.comm.rank + 2]
-    missing = not world.passages.left and len(ids) != most[1] - most[0]
+    missing = not world.passages.removed_count and len(ids) != most[1] - most[0]
     if missing or (np.diff(ids) <= 0).any() or ((ids < most[0]) | (ids >= most[1])).any():
         wrong.append("id of a grain")
     refuse(world.comm, f"a state that no run can have: {', '.join(wrong)}" if wrong else "")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,10 @@ from dem import bodies, quaternion, shapes
 from dem.arrays import Floats
 from dem.bodies import BOX, CAPSULE, MESH, PLANE, Bodies
 from dem.motion import Dynamic
-from dem.scene import LargeBody, Scene
 from dem.shapes import Plane, Shape, placed
+
+if TYPE_CHECKING:
+    from dem.scene import LargeBody, Scene
 
 STEEP = 0.1  #: cosine between the way and the normal of a surface below which it is a wall
 DENSE = 0.64  #: solid fraction of a settled bed
@@ -49,20 +51,20 @@ def fall(scene: Scene, acceleration: Floats, start: float = 0.0) -> Fall:
     halves = bodies.least_half_thickness(every)
     half = float(halves.min())
     first, gap, column = 0.0, np.inf, 0.0
-    lasts = [_last(_corners(*box), along, planes, levels) for box in scene.passages.boxes()]
+    lasts = [_longest_path(_corners(*box), along, planes, levels) for box in scene.passages.boxes()]
     if grains.count:
         corners = _corners(grains.low, grains.high)
         bed, gap, column = _bed(scene, along, every)
-        first = _first(corners, along, planes, levels) - half
-        lasts += [_last(corners, along, planes, levels) - bed, first + half]
+        first = _shortest_path(corners, along, planes, levels) - half
+        lasts += [_longest_path(corners, along, planes, levels) - bed, first + half]
     elif not lasts:  # large bodies alone: the highest falls on all others
-        lasts = [_last(every.position, along, planes, levels) - 2.0 * float(halves.sum() - half)]
+        lasts = [_longest_path(every.position, along, planes, levels) - 2.0 * float(halves.sum() - half)]
     squares = (start * start + 2.0 * size * max(way, 0.0) for way in (max(lasts) - half, first))
     last, block = (math.sqrt(min(square, 1e300)) for square in squares)
     return Fall(last, block, gap, column)
 
 
-def way_of(scene: Scene, body: LargeBody, along: Floats) -> float:
+def free_path(scene: Scene, body: LargeBody, along: Floats) -> float:
     """How far a large body may go along a direction (3,) before it meets another one, at most; 0 without an end [m]."""
     planes, levels = _ends(scene, along, besides=body)
     corners = [_corners(-extent, extent) + place for place, extent in (box(body, shape) for shape in body.shapes)
@@ -120,14 +122,14 @@ def _to_planes(place: Floats, along: Floats, planes: Floats) -> Floats:
     return drop
 
 
-def _last(place: Floats, along: Floats, planes: Floats, levels: Floats) -> float:
+def _longest_path(place: Floats, along: Floats, planes: Floats, levels: Floats) -> float:
     """The longest way from places (n, 3): through a half space nothing goes, past other parts of bodies it may."""
     if len(planes):
         return float(_to_planes(place, along, planes).max())
     return float(levels.max() - (place @ along).min())
 
 
-def _first(place: Floats, along: Floats, planes: Floats, levels: Floats) -> float:
+def _shortest_path(place: Floats, along: Floats, planes: Floats, levels: Floats) -> float:
     """The shortest way from places (n, 3) to a half space or to a part of a body beyond all of them."""
     ways = np.append(levels - (place @ along).max(), _to_planes(place, along, planes).min())
     return float(ways[ways >= 0.0].min(initial=np.inf)) if np.isfinite(ways[ways >= 0.0]).any() else 0.0

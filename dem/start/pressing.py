@@ -15,7 +15,7 @@ from dem.motion import Dynamic, Guided, Hinged
 from dem.parts.ends import End
 from dem.parts.named import Named, Pressing
 from dem.scene import LargeBody, Scene, kinds_of
-from dem.start.falls import box, way_of
+from dem.start.falls import box, free_path
 
 CHAINS = 4.0  #: the strongest forces between grains over those that a like share of the load makes
 
@@ -65,7 +65,7 @@ def _tools(scene: Scene, pushes: Sequence[tuple[str, Floats, float]]) -> Pressin
             continue
         greatest = max(greatest, share * size)
         if share == 1.0 and force.any():
-            way = max(way_of(scene, body, along) - (2.0 * radius if count else 0.0), 0.0)
+            way = max(free_path(scene, body, along) - (2.0 * radius if count else 0.0), 0.0)
             speed = math.sqrt(2.0 * size / body.mass * way)
             if isinstance(motion, Guided) and motion.speed is not None and motion.force >= body.mass * falls:
                 speed = min(speed, abs(motion.speed))  # which the servo keeps

@@ -144,7 +144,7 @@ def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float, 
 
 
 @loop
-def pull_back(r: Floats, compliance: Floats, held: Floats) -> None:
+def subtract_tangential_springs(r: Floats, compliance: Floats, held: Floats) -> None:
     """Take from r (nc, 3) what tangential springs give that held these impulses (nc, 2) before the step."""
     for c in range(len(r)):
         for k in range(2):
@@ -158,13 +158,13 @@ def held_after(stiffness: Floats, compliance: Floats, dt: float, held: Floats, i
     out = np.empty((len(impulse), 3))
     for c in range(len(held)):
         out[c, 0] = impulse[c, 0]
-        out[c, 1], out[c, 2] = _kept(stiffness, compliance, dt, held, impulse, c)
+        out[c, 1], out[c, 2] = _held_by_springs(stiffness, compliance, dt, held, impulse, c)
     out[len(held) :] = impulse[len(held) :]
     return out
 
 
 @inlined
-def _kept(stiffness, compliance, dt, held, impulse, c):
+def _held_by_springs(stiffness, compliance, dt, held, impulse, c):
     share = 1.0 if np.isinf(stiffness[c]) else stiffness[c] * dt**2 * compliance[c, 0]
     one = held[c, 0] + share * (impulse[c, 1] - held[c, 0]) if share > 0.0 else 0.0
     other = held[c, 1] + share * (impulse[c, 2] - held[c, 1]) if share > 0.0 else 0.0
@@ -188,16 +188,16 @@ def spring_energies(
         if np.isinf(stiffness[c]):
             continue
         k, per = stiffness[c], TANGENTIAL * stiffness[c] * dt**2
-        start += 0.5 * k * _borne(k, compliance[c, 0], dt, past[c], gap[c], last[c]) ** 2
-        end += 0.5 * k * _borne(k, compliance[c, 0], dt, gap[c], after[c], impulse[c, 0]) ** 2
-        one, other = _kept(stiffness, compliance, dt, held, impulse, c)
+        start += 0.5 * k * _loaded_overlap(k, compliance[c, 0], dt, past[c], gap[c], last[c]) ** 2
+        end += 0.5 * k * _loaded_overlap(k, compliance[c, 0], dt, gap[c], after[c], impulse[c, 0]) ** 2
+        one, other = _held_by_springs(stiffness, compliance, dt, held, impulse, c)
         strained += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / per
         strained_at_end += 0.5 * (one**2 + other**2) / per
     return start, end, strained, strained_at_end
 
 
 @inlined
-def _borne(stiffness, compliance, dt, begin, gap, impulse):
+def _loaded_overlap(stiffness, compliance, dt, begin, gap, impulse):
     left = (1.0 - stiffness * dt**2 * compliance) * max(-begin, 0.0)  # of an overlap that no impulse has changed
     return max(min(-gap, dt * compliance * impulse + left), 0.0)
 

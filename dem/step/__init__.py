@@ -12,21 +12,23 @@ from functools import cached_property
 import numpy as np
 
 from dem import bodies, quaternion
-from dem.arrays import ArrayLike, Bools, Floats, Ints, places
-from dem.bodies import SPHERE, Bodies
-from dem.contact import Contacts, contact_order, find_contacts, goes_beyond, velocities_about, ways
+from dem.arrays import ArrayLike, Bools, Floats, Ints, Keys, places
+from dem.bodies import CLUMP, POLYHEDRON, SPHERE, Bodies
+from dem.contact import Contacts, contact_order, exceeds_margin, find_contacts, greatest_travel, velocities_about
 from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
 from dem.measures import Sample
 from dem.model.world import World
+from dem.shapes.clumps import arm
 from dem.step.laws import along_normal
 from dem.step.system import ContactSystem, contact_arms, contact_frames, gap_velocities
-from dem.together import meet
+from dem.together import barrier
 from dem.unconstrained import UnconstrainedMotion, large_velocity
 
 #: Of two linearisations of a contact the later one replaces the other: cosine between their normals, at least, and way
 #: between their points over the overlap that is let pass, at most.
 ALIKE, NEAR = 0.99, 10.0
+BESIDE = (0.0, 0.5j, 0.25j)  #: what keys of later linearisations have more, by how often it was tried before
 
 
 @dataclass(frozen=True, repr=False)
@@ -73,7 +75,7 @@ class Step:
     def total(self, values: ArrayLike) -> float:
         """The sum of values (grains,) over all grains; each rank passes those of its `world.grains`. Collective: the
         `record` of a scene must call it on all ranks."""
-        return meet(self.world.comm, "Step.total", number=float(np.sum(values)))
+        return barrier(self.world.comm, "Step.total", number=float(np.sum(values)))
 
     @property
     def in_cone(self) -> Floats:
@@ -142,8 +144,8 @@ def advance(
     contacts; `kept` (owned, 6) are those with which they go into the next step, if they are others. Collective.
 
     x <- x + dt (v + E x) + lag, q <- exp(dt w) q, with the rate E of a cell that changes its size, and the lag
-    (grains, 3) of `Contacts` [m]. The next search begins with the lists of this one, and the balancer goes by the
-    contacts that grains own.
+    (grains, 3) of `Contacts` [m]; grains outside of a sheared cell go with the images there. The next search begins
+    with the lists of this one, and the balancer goes by the contacts that grains own.
     Prescribed motions are followed exactly, whatever dt.
     """
     dt, start, of_large = free.dt, world.grains.position, large_velocity(world, free, velocity)
@@ -159,7 +161,8 @@ def advance(
         world.grains.position = world.grains.position + dt * world.cell.rate * start
     if free.applied is not None:
         world.memory = free.applied.memory
-    world.cell = world.cell.after(dt)
+    then, world.cell = world.cell, world.cell.after(dt)
+    world.grains.velocity = world.cell.taken_along(then, start, world.grains.velocity)
     world.time += dt
     world.step += 1
     world.put_large(free.poses)
@@ -189,11 +192,11 @@ def find_overrun(
     The search may be repeated for the contacts that it finds: margins only grow.
     """
     dt, seen = free.dt, contacts.near.margin[: contacts.near.grains]
-    way = ways(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
+    way = greatest_travel(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
     way = way + world.cell.margin(dt, world.grains)
     large = large_velocity(world, free, velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
-    gone = bool((way > seen).any()), goes_beyond(world, dt * large, contacts.shifts, delta)
+    gone = bool((way > seen).any()), exceeds_margin(world, dt * large, contacts.shifts, delta)
     further, beyond = on_any(world.comm, *gone)
     if not (further or beyond):
         return None
@@ -222,24 +225,28 @@ def find_turned(
     recovery_speed: float, tried: int,
 ) -> Contacts | None:  # fmt: skip
     """The contacts, with those that overlap by more than `depth` [m] if bodies go on for a step with these velocities
-    (owned, 6); None if there are none, or if the grains that are no spheres turn by less than that; collective.
+    (owned, 6), and that deeper than foreseen; None if there are none, or if the grains that are no spheres turn by less
+    than that; collective.
 
     A step takes the gap of a contact as linear in the velocities. Where bodies turn, its point and its normal move, and
     other points may meet. What overlaps at the end of the step is linearised there: with the normal n of the end, and
     the gap at the start that leads to the gap of the end with these velocities. This is a step of Newton's method (of
-    sequential quadratic programming) for the gaps at the end of the step. Where it was `tried` in this time step, what
-    turns between two features, or rocks on a flat side, would go to and fro for ever: a linearisation with another
-    normal or point then stays, and the new one is a contact beside it.
+    sequential quadratic programming) for the gaps at the end of the step. What springs bear, and what a solution
+    leaves, is foreseen. Where it was `tried` in this time step, what turns between two features, or rocks on a flat
+    side, would go to and fro for ever: a linearisation with another normal or point then stays, and the new one is a
+    contact beside it.
     """
     dt = free.dt
     if not _turn(world, velocity[: len(world.grains)], dt, depth):
         return None
     end = find_contacts(advanced(world, free, contacts, velocity), 0.0)
     end = end.take(end.gap < -depth)
-    start, approach = _at_start(world, end, dt)
+    large = large_velocity(world, free, velocity)
+    foreseen = _foreseen(world, contacts, velocities_about(contacts, velocity, large), dt, end.key)
+    start, approach = _at_start(world, end, velocities_about(end, velocity, large), dt)
     overlap = -(dt * gap_velocities(world, start, dt, recovery_speed)[2] + approach)
     a, b, known = _rows_in(contacts, end)
-    missed = known & (overlap > depth)
+    missed = known & (overlap > depth) & (end.gap < foreseen - depth)
     if not on_any(world.comm, bool(missed.any()))[0]:
         return None
     if contacts.linear is not None:
@@ -251,7 +258,7 @@ def find_turned(
         place = places(contacts.key, found.key)
         others = np.einsum("ci,ci->c", contacts.normal[place], found.normal) < ALIKE
         others |= quaternion.length(contacts.point[place] - found.point) > NEAR * depth
-        found = replace(found, key=np.where((place >= 0) & others, found.key + 0.5**tried * 1j, found.key))
+        found = replace(found, key=np.where((place >= 0) & others, found.key + BESIDE[tried], found.key))
     return _joined(world, contacts.take(places(found.key, contacts.key) < 0), found)
 
 
@@ -265,21 +272,39 @@ def _overlaps_of(contacts: Contacts, body: Ints) -> Floats:
     return deepest[row]
 
 
+def _foreseen(world: World, contacts: Contacts, velocity: Floats, dt: float, key: Keys) -> Floats:
+    """The gaps (n,) at the end of a step with these velocities (rows, 6) that contacts of these keys foresee, the least
+    of those of a pair of features; inf where there are none [m]."""
+    gap = np.full(len(key), np.inf)
+    for tried in BESIDE:
+        place = places(contacts.key, key + tried)
+        of = contacts.take(place[place >= 0])
+        end = of.linear_gap + dt * _opening(world, of, of.near.bodies.position, velocity)
+        gap[place >= 0] = np.minimum(gap[place >= 0], end)
+    return gap
+
+
 def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
-    """Whether points of grains that are no spheres move by more than `depth` as these turn, on any rank. False if a
-    velocity is not finite."""
+    """Whether grains that are no spheres turn so that contacts may be deeper by more than `depth` than foreseen, on any
+    rank. False if a velocity is not finite.
+
+    Points of their surfaces move by more than that, which brings others near. Of a clump these are on spheres, whose
+    centres go on arcs: at most c w^2 / 2 off their tangents, for a distance c from the centre, of each of a pair."""
     if world.only_spheres:
         return False
-    grains = world.grains
-    way = dt * bodies.bounding_radius(grains) * quaternion.length(velocity[:, 3:])
+    grains, angle = world.grains, dt * quaternion.length(velocity[:, 3:])
+    way, clump = bodies.bounding_radius(grains) * angle, (grains.shape >= CLUMP) & (grains.shape < POLYHEDRON)
+    if clump.any():
+        arms = np.array([arm(form) for form in world.forms])
+        way[clump] = arms[grains.shape[clump] - CLUMP] * angle[clump] ** 2
     fast, finite = bool((way[grains.shape != SPHERE] > depth).any()), bool(np.isfinite(velocity).all())
     fast, not_finite = on_any(world.comm, fast, not finite)
     return fast and not not_finite
 
 
-def _at_start(world: World, end: Contacts, dt: float) -> tuple[Contacts, Floats]:
-    """The contacts of the end of a step as contacts of its start, and by how much (nc,) their gaps grow in it [m]."""
-    velocity = end.near.bodies.velocity
+def _at_start(world: World, end: Contacts, velocity: Floats, dt: float) -> tuple[Contacts, Floats]:
+    """The contacts of the end of a step with these velocities (rows, 6) as contacts of its start, and by how much (nc,)
+    their gaps grow in it [m]."""
     start = replace(end, point=end.point - 0.5 * dt * (velocity[end.a, :3] + velocity[end.b, :3]))
     position = end.near.bodies.position - dt * velocity[:, :3]
     flow = end.flow(world.cell, end.near.bodies.position)

@@ -101,7 +101,7 @@ def _meet(world: World, contacts: Contacts, table: Floats, delta: float, dt: flo
     closes: Bools = contacts.linear_gap + np.einsum("ci,ci->c", way, contacts.normal) < -0.01 * delta
     balls = (shape == SPHERE).all(axis=1)
     radii = near.bodies.size[row[balls], 0].sum(axis=1)
-    apart = contacts.way(near.bodies.position)[balls]
+    apart = contacts.branch(near.bodies.position)[balls]
     square = np.maximum(length(way[balls]) ** 2, 1e-300)
     share = -np.einsum("ci,ci->c", apart, way[balls]) / square
     nearest = apart + np.clip(share, 0.0, 1.0)[:, None] * way[balls]

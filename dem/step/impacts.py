@@ -70,7 +70,9 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     if pairs.restitution.any():
         old = old.copy()
         old[grains:] = motion.prescribed
-    image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
+    image = np.zeros(contacts.normal.shape)
+    if world.cell.periodic:
+        image -= world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     slow, radius = dt * math.hypot(*world.gravity), np.ascontiguousarray(table.size[:, 0])
     kind, bounce, offset, marked = struck(
         (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
@@ -80,7 +82,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     if not on_any(world.comm, bool(marked.any()))[0]:
         return contacts
     rows = np.stack([contacts.a, contacts.b], axis=1)
-    chosen = np.flatnonzero(_reached(world, contacts, rows[kind == PAIR], marked)[rows].any(axis=1))
+    chosen = np.flatnonzero(_reached(world, contacts, rows, kind, marked)[rows].any(axis=1))
     free = velocities_about(contacts, motion.grains, old[grains:])
     forced = free[:, :3] - old[:, :3]
     columns = (table.position, free, forced, radius[:, None], table.mass[:, None], table.inertia[:, :1])
@@ -135,11 +137,12 @@ def _with_impacts(
     return replace(contacts, normal=turned, point=point, moved=moved, linear=linear, parting=parting, lag=lag)
 
 
-def _reached(world: World, contacts: Contacts, pairs: Ints, marked: Bools) -> Bools:
-    """The bodies (rows,) that impacts of the marked ones may reach: through open contacts of spheres, the rows `pairs`
-    (m, 2), that touch no other grain; collective."""
+def _reached(world: World, contacts: Contacts, rows: Ints, kind: Ints, marked: Bools) -> Bools:
+    """The bodies (rows,) that impacts of the marked ones may reach, through contacts of these rows (nc, 2) of spheres
+    that are open, or close at once, and touch no other grain; collective."""
     halo, flags = contacts.lists.halo, np.zeros((len(marked), 2))
-    beside = (contacts.gap <= 0.0) & (contacts.b < contacts.near.grains + contacts.near.ghosts)
+    pairs = rows[kind == PAIR]
+    beside = (contacts.gap <= 0.0) & (kind == OTHER) & (contacts.b < contacts.near.grains + contacts.near.ghosts)
     flags[:, 0] = marked
     flags[contacts.a[beside], 1] = flags[contacts.b[beside], 1] = 1.0
     while True:
@@ -187,7 +190,7 @@ def struck(
         if meets[c]:
             for i in range(3):
                 push[a, i], push[b, i] = -n[i], n[i]
-        elif closed:
+        elif closed and not (kind[c] == PAIR and dot(v, n) > slow):  # not two that an impact has just parted
             kind[c], touches[a], touches[b] = OTHER, True, True
     for c in range(count):
         if kind[c] == OTHER and gap[c] <= 0.0:

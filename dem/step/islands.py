@@ -3,16 +3,20 @@ another, so each may have an accuracy of its own."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from dem import bodies
-from dem.arrays import Floats, Ints
+from dem.arrays import Bools, Floats, Ints
 from dem.compiled import loop
 from dem.contact_map.halo import Halo
 from dem.exchange import exchange, on_any
 from dem.model.world import World
-from dem.step.system import ContactSystem
 from dem.unconstrained.constraints import slots
+
+if TYPE_CHECKING:
+    from dem.step.system import ContactSystem
 
 ROUND = 3  #: contacts that a single sphere may have at rest
 
@@ -25,42 +29,53 @@ def contacts_at_rest(world: World, system: ContactSystem, passing: Floats, slow:
 
     Returns the contacts of this rank, ascending, and the greatest part of that energy that one of its islands has. A
     single sphere is no island, and a cell that deforms connects all bodies. Collective."""
-    nothing = np.zeros(0, np.intp), 0.0
     if system.cell is not None:
-        return nothing
-    near, contact_map = system.near, system.contact_map
+        return np.zeros(0, np.intp), 0.0
+    moves, root, name = _shares(world, system)
+    sums, fastest = np.zeros((len(moves), 5)), np.zeros(len(moves))
+    table, body = system.near.bodies, system.contact_map.body
+    _add_energies(root, moves, table.mass, table.inertia, table.velocity, system.free_velocity, sums)
+    _add_contacts(body, root, moves, passing, sums, fastest)
+    # where no rank has a share that rests no island does, as its sums are those of its shares
+    if not on_any(world.comm, bool((sums[:, 0] < slow * sums[:, 1]).any()))[0]:
+        return np.zeros(0, np.intp), 0.0
+    name = _names(system.contact_map.halo, root, name)
+    rows = np.flatnonzero((sums[:, 2:] > 0.0).any(axis=1))
+    resting, part = np.zeros(len(moves), np.bool_), _parts_at_rest(world, name[rows], sums[rows], fastest[rows], slow)
+    resting[rows] = part >= 0.0
+    a, b = body.T
+    return np.flatnonzero(resting[root[np.where(moves[a], a, b)]]), float(part.max(initial=0.0))
+
+
+def _shares(world: World, system: ContactSystem) -> tuple[Bools, Ints, Ints]:
+    """Of the bodies near this rank: which move, the row that stands for this rank's share of the island of each, and a
+    name for each, that joints connect by the same one."""
+    near = system.near
     moves = bodies.is_dynamic(near.bodies)
     jointed = np.zeros(len(moves), np.bool_)
     if system.coupling is not None:
         jointed[slots(world, near.bodies.id)[0]] = True
     jointed &= moves
-    root = _roots(contact_map.body, moves, jointed)
-    sums, fastest = np.zeros((len(moves), 5)), np.zeros(len(moves))
-    table, free = near.bodies, system.free_velocity
-    _add_energies(root, moves, table.mass, table.inertia, table.velocity, free, sums)
-    _add_contacts(contact_map.body, root, moves, passing, sums, fastest)
-    # where no rank has a share that rests no island does, as its sums are those of its shares
-    if not on_any(world.comm, bool((sums[:, 0] < slow * sums[:, 1]).any()))[0]:
-        return nothing
-    name = _names(contact_map.halo, root, np.where(jointed, -1, near.index))
-    each = np.flatnonzero((sums[:, 2:] > 0.0).any(axis=1))  # an island of this rank, or its share of one
-    owner = np.maximum(np.searchsorted(world.slabs, name[each], side="right") - 1, 0)
-    owner = np.minimum(owner, world.comm.size - 1)
-    columns = {"name": name[each], "sums": sums[each], "fastest": fastest[each], "row": each}
-    asked = exchange(world.comm, columns | {"rank": np.full(len(each), world.comm.rank)}, owner)
-    names, island = np.unique(asked["name"], return_inverse=True)
+    return moves, _roots(system.contact_map.body, moves, jointed), np.where(jointed, -1, near.index)
+
+
+def _parts_at_rest(world: World, name: Ints, sums: Floats, fastest: Floats, slow: float) -> Floats:
+    """The part (s,) that the kinetic energy of the island of each share is of that of free fall, -1 if it does not
+    rest. Every island is added up by the rank that owns its name. Collective."""
+    owner = np.clip(np.searchsorted(world.slabs, name, side="right") - 1, 0, world.comm.size - 1)
+    columns = {"name": name, "sums": sums, "fastest": fastest, "row": np.arange(len(name))}
+    shares = exchange(world.comm, columns | {"rank": np.full(len(name), world.comm.rank)}, owner)
+    names, island = np.unique(shares["name"], return_inverse=True)
     whole, most = np.zeros((len(names), 5)), np.zeros(len(names))
-    np.add.at(whole, island, asked["sums"])
-    np.maximum.at(most, island, asked["fastest"])
+    np.add.at(whole, island, shares["sums"])
+    np.maximum.at(most, island, shares["fastest"])
     kinetic, fall, mass, many, count = whole.T
     rests = (kinetic < slow * fall) & (0.5 * mass * most**2 <= fall) & ((many > 1.0) | (count > ROUND))
-    part = np.divide(kinetic, fall, out=np.zeros_like(fall), where=rests)
-    told = exchange(world.comm, {"row": asked["row"], "rests": rests[island], "part": part[island]}, asked["rank"])
-    resting = np.zeros(len(moves), np.bool_)
-    resting[told["row"][told["rests"]]] = True
-    a, b = contact_map.body.T
-    contacts = np.flatnonzero(resting[root[np.where(moves[a], a, b)]])
-    return contacts, float(told["part"].max(initial=0.0))
+    part = np.divide(kinetic, fall, out=np.full(len(names), -1.0), where=rests)
+    answer = exchange(world.comm, {"row": shares["row"], "part": part[island]}, shares["rank"])
+    found = np.full(len(name), -1.0)
+    found[answer["row"]] = answer["part"]
+    return found
 
 
 def _names(halo: Halo, root: Ints, name: Ints) -> Ints:

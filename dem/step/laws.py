@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats
 from dem.bodies import COMPOUND
-from dem.contact import Contacts
 from dem.model.world import World
-from dem.parts.laws import Met
+from dem.parts.laws import ContactState
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
 
 
-def met(world: World, contacts: Contacts, dt: float, slip: Floats) -> Met:
+def contact_state(world: World, contacts: Contacts, dt: float, slip: Floats) -> ContactState:
     """The contacts of a step of dt [s] that slip (nc, 2) along their surfaces [m/s]."""
     table, a, b = contacts.near.bodies, contacts.a, contacts.b
     with np.errstate(divide="ignore"):  # of two large bodies, which are flat: inf
         curvature = 1.0 / np.where(table.shape == COMPOUND, np.inf, bodies.least_half_thickness(table))
         radius = 2.0 / (curvature[a] + curvature[b])
     mobility = 1.0 / table.mass[a] + 1.0 / table.mass[b]
-    return Met(dt, (table.material[a], table.material[b]), contacts.gap, radius, mobility, np.hypot(*slip.T))
+    return ContactState(dt, (table.material[a], table.material[b]), contacts.gap, radius, mobility, np.hypot(*slip.T))
 
 
 def along_normal(size: Floats) -> Floats:

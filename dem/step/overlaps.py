@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from dem.arrays import Floats, Ints
 from dem.bodies import BOX, COMPOUND, FORM
 from dem.compiled import inlined, loop
 from dem.exchange import reduced
-from dem.step import Step
+
+if TYPE_CHECKING:
+    from dem.step import Step
 
 
 def overlaps(step: Step, large: Floats) -> tuple[float, float]:

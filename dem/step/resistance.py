@@ -7,14 +7,17 @@ the same for moments as for forces.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from dem.arrays import Floats
-from dem.contact import Contacts
 from dem.contact_map import ContactMap, TurningMap
 from dem.model.world import World
+from dem.parts.laws import ContactState
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
 
 
 class Resistance(NamedTuple):
@@ -26,18 +29,18 @@ class Resistance(NamedTuple):
     velocity: Floats  #: (nc, 3) lengths times angular velocities without impulses [m/s]
 
 
-def resistance(world: World, contacts: Contacts, known: ContactMap, frame: Floats, free: Floats) -> Resistance | None:
-    """Of contacts with their map without turning, frames (nc, 3, 3), and the free velocities (rows, 6) of all bodies in
-    the rows of `near`; None, on all ranks, in a world without resistance."""
-    moments = world.pairs.moments()
-    if moments is None:
+def resistance(
+    world: World, contacts: Contacts, met: ContactState | None, known: ContactMap, frame: Floats, free: Floats
+) -> Resistance | None:
+    """Of contacts, as laws have met them, with their map without turning, frames (nc, 3, 3), and the free velocities
+    (rows, 6) of all bodies in the rows of `near`; None, on all ranks, in a world without resistance."""
+    if met is None or (moments := world.pairs.moments(met)) is None:
         return None
     table, a, b = contacts.near.bodies, contacts.a, contacts.b
-    one, two = table.material[a], table.material[b]
     mobility = 1.0 / table.mass[a] + 1.0 / table.mass[b]
     turns = (1.0 / table.inertia[a] + 1.0 / table.inertia[b]).mean(axis=1)
     length = np.sqrt(np.divide(mobility, turns, out=np.ones(len(a)), where=(turns > 0.0) & (mobility > 0.0)))
     turn = (frame * length[:, None, None]).reshape(-1, 9)
     G = TurningMap(known.comm, known.given, turn, known.halo, known.body, mass=known.mass)
-    tangents, normals = (values[one, two] / length for values in moments)
+    tangents, normals = (values / length for values in moments)
     return Resistance(G, length, (tangents, normals), G.turning(free))

@@ -19,13 +19,17 @@ part KEPT of the last E, up to the rates that are given; without these it is zer
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats
-from dem.contact import Contacts
 from dem.contact_map.mass import CellStep
 from dem.model.world import World
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
 
 CLOSING = 0.01  #: rate times d sqrt(rho / P): a loose cell closes in quasistatic motion
 LEADING = 5.0
@@ -35,7 +39,7 @@ KEPT = 0.9
 def cell_stress(world: World, contacts: Contacts, force: Floats) -> Floats:
     """Stress (3, 3) of a cell with three periods after a step, of the forces (nc, 3) [N] of its contacts (Love, Weber)
     and of the motion of the grains beside that of the cell, positive in compression [Pa]; collective."""
-    borne = world.comm.allreduce(force.T @ contacts.way(contacts.near.bodies.position))
+    borne = world.comm.allreduce(force.T @ contacts.branch(contacts.near.bodies.position))
     stress: Floats = borne / world.cell.volume + _motion(world)[0]
     return stress
 
@@ -54,13 +58,12 @@ def _motion(world: World) -> tuple[Floats, float]:
     return stress, float(np.sqrt(6.0 / np.pi * mass / size))
 
 
-def cell_of(world: World, contacts: Contacts, frame: Floats, dt: float) -> CellStep | None:
-    """How the cell takes part in a step from contacts with the frames (nc, 3, 3); None where its size is constant;
-    collective."""
+def cell_of(world: World, dt: float) -> CellStep | None:
+    """How the cell takes part in a step; None where its size is constant; collective."""
     cell = world.cell
     if not cell.deforms:
         return None
-    given = cell.given_at(world.time, dt)
+    given = cell.given_rates(world.time, dt)
     follows = np.isnan(given) & ~np.isnan(cell.stress)
     asked = np.where(follows, cell.stress, 0.0)
     stress, time = _motion(world)
@@ -70,5 +73,4 @@ def cell_of(world: World, contacts: Contacts, frame: Floats, dt: float) -> CellS
     root = np.where(follows, 1.0 / np.sqrt(eta * dt * cell.volume), 0.0)
     kept = np.clip(KEPT * cell.rate, -leads, leads)
     free = np.where(follows, kept + (np.diag(stress) - asked) / eta, np.nan_to_num(given))
-    way = contacts.way(contacts.near.bodies.position)
-    return CellStep((frame * way[:, None]).reshape(-1, 9), root, free)
+    return CellStep(root, free)

@@ -7,16 +7,18 @@ a contact. So friction acts against the sliding along the belt.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dem import checks, quaternion
 from dem.arrays import Floats
-from dem.contact import Contacts
 from dem.model.world import World
 from dem.scene import LargeBody
 from dem.together import together
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
 
 
 def surface_velocities(world: World, contacts: Contacts, frame: Floats) -> Floats | None:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -25,7 +26,6 @@ from dem import bodies
 from dem.arrays import Floats, Keys, places
 from dem.bodies import Bodies
 from dem.compiled import loop
-from dem.contact import Contacts
 from dem.contact_map import CompactRows, ContactMap, Halo
 from dem.contact_map.loops import closing, scale
 from dem.contact_map.mass import CellMass, ConstrainedMass
@@ -34,13 +34,16 @@ from dem.free_motion import kept_spin
 from dem.model.world import World, turns_unlike_spheres
 from dem.parts.laws import Solved
 from dem.start import stiffness
-from dem.step.laws import along_normal, met
+from dem.step.laws import along_normal, contact_state
 from dem.step.resistance import resistance
 from dem.step.servo import cell_of
 from dem.step.surface import surface_velocities
 from dem.unconstrained import UnconstrainedMotion, free_velocities, large_velocity
 from dem.unconstrained.constraints import coupling_of, coupling_refound, slots
 from dem.unconstrained.drives import Drives, free_directions
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
 
 #: Bodies that contacts turned by more radians in the last step were struck: those impulses do not come again.
 STRUCK = 0.05
@@ -106,8 +109,8 @@ class ContactSystem:
         self.surface = surface_velocities(world, contacts, self.frame)
         self.take_flow(world, contacts)
         self.past = np.zeros((len(contacts), world.pairs.columns)) if kept is None else kept
-        self.met = met(world, contacts, dt, self._slip(contacts)) if world.pairs.acting else None
-        pull = None if self.met is None else world.pairs.pull(self.met, self.past)
+        self.met = contact_state(world, contacts, dt, self._slip(contacts)) if world.pairs.acting else None
+        pull = None if self.met is None else world.pairs.attraction(self.met, self.past)
         self.attraction = None if pull is None else dt * pull
         self.mu = contacts.friction if self.met is None else world.pairs.cone(self.met, self.past, contacts.friction)
         self.friction = self.mu
@@ -122,11 +125,12 @@ class ContactSystem:
         self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
         if self.surface is not None:
             self.b[:, 1:] = self.surface
-        self.cell = cell_of(world, contacts, self.frame, dt)
+        self.cell = cell_of(world, dt)
         if self.cell is not None:
             mass = CellMass(world.comm, self.contact_map.given.root, self.cell)
             self.contact_map = self.contact_map.with_mass(mass)
-            mass.add_flow(self.cell.free, freely)
+            way = contacts.branch(near.bodies.position)
+            freely += np.einsum("cij,cj->ci", self.frame, self.cell.free * way)
         if contacts.drift is not None:
             freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
         self._attracted: Floats | float = 0.0  #: mass-scaled momenta of the attraction
@@ -134,7 +138,7 @@ class ContactSystem:
             self._attracted = momentum = self.contact_map.momenta(along_normal(-self.attraction))
             self.free_velocity = self.velocity_with(momentum)
             freely += self.contact_map.velocities(momentum)
-        self.resistance = resistance(world, contacts, self.contact_map, self.frame, free)
+        self.resistance = resistance(world, contacts, self.met, self.contact_map, self.frame, free)
         self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
         if self.resistance is not None and self.attraction is not None:
             self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
@@ -152,7 +156,7 @@ class ContactSystem:
         if contacts.swing is not None:  # impacts last no step
             self.b[:, 1:] += np.where(impacts[:, None], 0.0, np.einsum("cij,cj->ci", self.frame[:, 1:], contacts.swing))
         self.r = _beyond(self.b, freely, rounding)
-        stiffness.pull_back(self.r, self.compliance, self.held)
+        stiffness.subtract_tangential_springs(self.r, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
 
@@ -381,7 +385,7 @@ def inverse_root_masses(world: World, drives: Drives) -> Floats:
     """M^-1/2 of the bodies whose rows this rank owns, as `CompactRows.root` has it: (owned, 6) where that is all on all
     ranks, else (owned, 12)."""
     last = world.comm.rank == world.comm.size - 1
-    tables = [world.grains, gripped(world.large, drives)] if last else [world.grains]
+    tables = [world.grains, with_servos(world.large, drives)] if last else [world.grains]
     if world.only_spheres and not bodies.is_dynamic(world.large).any():
         parts = [_inverse_roots(table.mass, table.inertia) for table in tables]
         return np.concatenate(parts) if last else parts[0]
@@ -405,7 +409,7 @@ def _inverse_roots(mass: Floats, inertia: Floats) -> Floats:
     return out
 
 
-def gripped(large: Bodies, drives: Drives) -> Bodies:
+def with_servos(large: Bodies, drives: Drives) -> Bodies:
     """The large bodies with what servos add to their masses and to their moments about hinges."""
     if not drives.grip.any():
         return large

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,8 +21,10 @@ from dem.model.world import World
 from dem.motion import Pose
 from dem.together import together
 from dem.unconstrained.applied import Applied, applied_impulses
-from dem.unconstrained.constraints import Coupling
 from dem.unconstrained.drives import Drives, drives_of, given_velocities
+
+if TYPE_CHECKING:
+    from dem.unconstrained.constraints import Coupling
 
 
 @dataclass(frozen=True)

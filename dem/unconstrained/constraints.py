@@ -24,7 +24,7 @@ from mpi4py import MPI
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.compiled import loop
-from dem.exchange import told
+from dem.exchange import broadcast
 from dem.free_motion import free_spin, unequal
 from dem.model.world import World
 from dem.motion import DROOP
@@ -241,13 +241,13 @@ def coupling_of(
         gathered[slot] = push[here]
         world.comm.Allreduce(MPI.IN_PLACE, gathered)
     found = coupling(parts, ends, dt, world.cell, gathered) if world.comm.rank == 0 else None
-    return told(world.comm, found)
+    return broadcast(world.comm, found)
 
 
 def coupling_refound(world: World, known: Coupling, push: Floats) -> Coupling | None:
     """`refound`, by the first rank for all; collective."""
     found = refound(known, push) if world.comm.rank == 0 else None
-    return told(world.comm, found)
+    return broadcast(world.comm, found)
 
 
 def slots(world: World, id: Ints) -> tuple[Ints, Ints]:

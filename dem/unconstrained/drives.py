@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.free_motion import free_velocity, velocity_changes
-from dem.model.world import World
 from dem.motion import DROOP, Driven, Dynamic, Guided, Pose, velocity_between
 from dem.scene import LargeBody
 from dem.together import together
+
+if TYPE_CHECKING:
+    from dem.model.world import World
 
 
 @dataclass(frozen=True)

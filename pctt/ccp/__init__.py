@@ -19,8 +19,9 @@ from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows
 from dem.exchange import on_each, refuse
+from pctt.arrays import Array, tangential
 from pctt.ccp.accuracy import Accuracy, figures, measure
-from pctt.ccp.cones import Array, FrictionCones, RollingCones, tangential
+from pctt.ccp.cones import FrictionCones, RollingCones
 from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.door import Operator
 from pctt.ccp.newton import FORMS, Newton

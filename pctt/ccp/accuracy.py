@@ -12,7 +12,8 @@ import numpy as np
 
 from dem.compiled import inlined, loop
 from dem.exchange import reduced
-from pctt.ccp.cones import Array, FrictionCones
+from pctt.arrays import Array
+from pctt.ccp.cones import FrictionCones
 from pctt.ccp.problem import ConeProblem
 
 ROUNDINGS = 8.0 * float(np.finfo(float).eps)

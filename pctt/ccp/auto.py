@@ -8,11 +8,11 @@ one that is easy costs nothing more.
 For Coulomb's law the conic method stalls often, but the path that it follows leads to the neighbourhood of a solution.
 So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes on from the end of its path.
 
-Small problems are the exception: there it goes on to the end, and to an aim beyond the limits. Where friction is
-large, from 2 on, both may fail: APGD circles about the law, and the path of the conic method ends at a wall of its
-cones. So it begins once more without a guess; then plain projected steps, which do not circle, and the conic method
-with shorter steps take turns, and at last there are cone problems for given De Saxce terms (`pctt.ccp.coulomb`). Where
-the relaxation has no solution, nothing says that Coulomb's law has one.
+Small problems are the exception: there it goes on to the end, and to an aim beyond the limits that APGD does not reach
+soon. Where friction is large, from 2 on, both may fail: APGD circles about the law, and the path of the conic method
+ends at a wall of its cones. So it begins once more without a guess; then plain projected steps, which do not circle,
+and the conic method with shorter steps take turns, and at last there are cone problems for given De Saxce terms
+(`pctt.ccp.coulomb`). Where the relaxation has no solution, nothing says that Coulomb's law has one.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from functools import partial
 
 import numpy as np
 
-from dem.exchange import told
+from dem.exchange import broadcast
+from pctt.arrays import Array
 from pctt.ccp import gathered
-from pctt.ccp.cones import Array
 from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
@@ -54,11 +54,11 @@ class Auto:
     turns: int = number(4, "of plain steps and the conic method, where it fails in a small problem of Coulomb's law")
     plain: int = number(100, "plain steps in the first of them; twice as many in each other one")
 
-    def iterations(self, contacts: int, tol: float, coulomb: bool, few: bool = False) -> int:
+    def iterations(self, problem: ConeProblem, tol: float, coulomb: bool, few: bool = False) -> int:
         """Those of APGD. Small problems have fixed costs; where they are ``few`` those of both methods are calls."""
-        per_digit = self.few if few else self.patience * np.cbrt(max(contacts, 400))
+        per_digit = self.few if few else self.patience * np.cbrt(max(problem.size, 400))
         per_digit *= self.law if coulomb else 1.0
-        return int(-np.log10(tol) * per_digit)
+        return broadcast(problem.comm, int(-np.log10(tol) * per_digit))
 
 
 def solve(
@@ -66,12 +66,11 @@ def solve(
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
     tried = Attempts(problem, limits, newton, coulomb)
-    few, small = newton.has_elimination(problem), problem.size <= by_elimination.FEW
-    begun = min(limits.max_it, told(problem.comm, options.iterations(problem.size, limits.tol, coulomb, few)))
-    first = tried.apgd(guess, begun)
+    small = problem.size <= by_elimination.FEW
+    first, few = tried.begin(guess, options)
     if first.converged and first.residual > limits.aimed:
         tried.beyond(guess, few)
-    elif not (first.final or first.exhausted) and begun < limits.max_it:
+    elif not (first.converged or first.final or first.exhausted) and first.iterations < limits.max_it:
         if not coulomb:
             settings = conic.Conic()
             tried.conic(first.impulse, replace(settings, start=min(settings.start, options.start * first.residual)))
@@ -110,6 +109,20 @@ class Attempts:
         self.all.append(result)
         return result
 
+    def begin(self, guess: Array, options: Auto) -> tuple[Result, bool]:
+        """What APGD makes of the guess, and whether the problem has few contacts. That is asked only where APGD has not
+        come to the aim as soon as the conic method would with few: the answer has its cost."""
+        count = partial(options.iterations, self.problem, coulomb=self.coulomb)
+        few = self.newton.may_eliminate(self.problem)
+        spare = options.iterations(self.problem, self.limits.aim, coulomb=False, few=True) if few else 0
+        first = self.apgd(guess, count(self.limits.tol, few=few), spare=spare)
+        if few and first.residual > self.limits.aimed:
+            few = self.newton.has_elimination(self.problem)
+            if not (few or first.converged or first.final or first.exhausted):
+                more = self.apgd(first.impulse, count(self.limits.tol))
+                self.all, first = [more.after(first)], more
+        return first, few
+
     def apgd(self, guess: Array, most: int, options: apgd.APGD = USUAL, spare: int = 0) -> Result:
         limits = replace(self.rest, max_it=min(most, self.limits.max_it), spare=spare)
         return self.keep(apgd.solve(self.problem, guess, limits, options, coulomb=self.coulomb), "apgd")
@@ -123,12 +136,13 @@ class Attempts:
         return self.keep(conic.solve(*given, coulomb=self.coulomb), "conic")
 
     def beyond(self, guess: Array, few: bool) -> None:
-        """To the aim of limits that APGD has met: few contacts by the conic method, many by APGD."""
+        """To the aim of limits that APGD has met: few contacts by the conic method, where APGD has not found it in its
+        first attempt, many by APGD."""
         given = guess, replace(self.rest, max_it=self.most), conic.Conic(), self.newton
         if few or gathered.takes(self.problem, self.newton):
             method = conic if few else gathered
             self.keep(method.solve(self.problem, *given, coulomb=self.coulomb), "conic")
-        if self.best.residual > self.limits.aimed and self.limits.spare:
+        if self.best.residual > self.limits.aimed and self.limits.spare and not few:
             self.apgd(self.best.impulse, self.limits.max_it, spare=self.limits.spare)
 
     @property

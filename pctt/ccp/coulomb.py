@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pctt.ccp.cones import Array, tangential
+from pctt.arrays import Array, tangential
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import FIXED_POINT, Limits, Result, Status
 

@@ -21,7 +21,8 @@ from scipy.sparse.linalg import LinearOperator, splu
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
 from dem.exchange import on_any, on_each, reduced, refuse
-from pctt.ccp.cones import Array, Cones
+from pctt.arrays import Array
+from pctt.ccp.cones import Cones
 from pctt.ccp.delassus import BlockMap, ColumnMap, GivenMatrix, GivenOperator, rows_of
 
 FULL = 10_000  # rows up to which N is found by a product with each unit vector, if nothing but products is known

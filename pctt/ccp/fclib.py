@@ -29,8 +29,9 @@ from mpi4py import MPI
 from scipy.sparse.linalg import MatrixRankWarning, spsolve
 
 from dem.contact_map import BlockRows
+from pctt.arrays import Array
 from pctt.blocks import square_block_matrix
-from pctt.ccp.cones import Array, Cones, FrictionCones, RollingCones
+from pctt.ccp.cones import Cones, FrictionCones, RollingCones
 from pctt.ccp.delassus import DENSE, rows_in_blocks
 from pctt.ccp.problem import ConeProblem
 from pctt.disk import FileError, hdf5, refuse_links, whole

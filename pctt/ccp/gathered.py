@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 
 from dem.exchange import offsets
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.delassus import GivenMatrix, rows_in_blocks
 from pctt.ccp.interior import conic
 from pctt.ccp.newton import Newton, by_elimination

@@ -15,8 +15,9 @@ from petsc4py import PETSc
 from dem.compiled import loop
 from dem.contact_map import BlockRows
 from dem.exchange import reduced, refuse
+from pctt.arrays import TINY, Array
 from pctt.ccp import door
-from pctt.ccp.cones import TINY, Array, Cones, FrictionCones
+from pctt.ccp.cones import Cones, FrictionCones
 from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, ritz_values, without_dense_columns
 
 

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, NamedTuple, Optional
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.ccp.cones import Array
-from pctt.ccp.problem import Errors
+from pctt.arrays import Array
 from pctt.options import FRACTION, number, option
+
+if TYPE_CHECKING:
+    from pctt.ccp.problem import Errors
 
 if TYPE_CHECKING:
     from pctt.ccp.accuracy import Accuracy

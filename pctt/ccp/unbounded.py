@@ -7,15 +7,18 @@ held by friction between them. The natural residual does not show it: it falls l
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dem.compiled import loop
 from dem.contact_map import find_halo
-from dem.exchange import told
-from pctt.ccp.cones import TINY, Array, tangential
+from dem.exchange import broadcast
+from pctt.arrays import TINY, Array, tangential
 from pctt.ccp.delassus import ColumnMap, sums_of
-from pctt.ccp.problem import ConeProblem
+
+if TYPE_CHECKING:
+    from pctt.ccp.problem import ConeProblem
 
 ROUNDED = 1e-4  # of the greatest eigenvalue of N: below it a negative one is of rounded digits, -1e-5 of five
 
@@ -58,7 +61,7 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
 def why_indefinite(problem: ConeProblem) -> str:
     """The reason, in words, if N has a direction of negative curvature beyond rounded digits, so that what a method
     finds need be no minimum; else "". The first time it takes some products with N. Collective."""
-    lowest = told(problem.comm, problem.lowest_curvature)
+    lowest = broadcast(problem.comm, problem.lowest_curvature)
     if lowest >= -ROUNDED:
         return ""
     return f"N is indefinite: d'Nd / d'd is {lowest:.1g} of the greatest for some impulses d"

@@ -13,7 +13,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from pctt.disk import FileError, told
+from pctt.disk import FileError, naming
 from pctt.folder import Folder
 from pctt.options import AT_LEAST_ONE, POSITIVE, OptionError, nearest, option
 
@@ -107,7 +107,7 @@ def chosen(steps: list[int], given: argparse.Namespace) -> list[int]:
     return picked
 
 
-def told_steps(folder: Folder, steps: list[int]) -> str:
+def described_steps(folder: Folder, steps: list[int]) -> str:
     """How many of the recorded steps these are, and a remark if frames of the run are missing."""
     lost = ", ".join(str(step) for step in folder.lost)
     return f"{len(steps)} of {len(folder.steps)} recorded steps{f' (missing: {lost})' if lost else ''}"
@@ -145,6 +145,6 @@ def run(main: Callable[[MPI.Comm], None], program: str) -> int:
 def made_folder(path: str | Path) -> Path:
     """Make the folder if it does not exist, and return it; FileError if this is not possible."""
     folder = Path(path)
-    with told(folder):
+    with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
     return folder

@@ -24,7 +24,7 @@ from pctt.pc.mat import finds_negative, iterations_with_the_diagonal
 from pctt.pc.nystrom import Identity, Nystrom, choose
 from pctt.pc.options import Account, Options
 from pctt.pc.transforms import DifferencesInverse
-from pctt.tt.conjugate import NO_PROMISE, Promise
+from pctt.tt.conjugate import NO_ESTIMATE, CostEstimate
 from pctt.tt.cross import CROSS
 from pctt.tt.inverse import Inverse, invert_positive
 from pctt.tt.train import Array
@@ -37,7 +37,7 @@ class EntriesTrain:
     """`make` makes a preconditioner for a matrix, `times` multiplies with it.
 
     transform : the fast transform that is used; None if it is a train, or the diagonal
-    promise : what a trial has shown of the preconditioner in use, for `pctt.pc.watch`; None: there is none
+    cost_estimate : what a trial has shown of the preconditioner in use, for `pctt.pc.watch`; None: there is none
     compressed, inverse : trains of the present matrix and of its inverse; None before `make`, and without a train
     rank : cap of the ranks
     failure : why a train that was wanted is not used; empty if all is as asked
@@ -54,8 +54,9 @@ class EntriesTrain:
         self._layout: Layout | None = None
         self.rank = options.max_rank if options.automatic else int(options.rank)
         self.transform: DifferencesInverse | Nystrom | Identity | None = None
-        self.promise: Promise | None = None
+        self.cost_estimate: CostEstimate | None = None
         self.compressed: GridTrain | None = None
+        self._product: TrainProduct
         self.inverse: Inverse | None = None
         self.symmetric = True
         self.failure = self.note = ""
@@ -73,7 +74,7 @@ class EntriesTrain:
         the diagonal, and 1 takes over if it fails. ValueError on all ranks for bad entries or a bad
         grid.
         """
-        self.failure, self.note, self.transform, self.promise = "", "", None, None
+        self.failure, self.note, self.transform, self.cost_estimate = "", "", None, None
         self._iterations = 50  # if there is no estimate
         if self.rank == 1:
             return False
@@ -94,7 +95,8 @@ class EntriesTrain:
         refused = self._make_train(P, layout, options.setup_limit or limit)
         if refused:
             return self._take_no_train(A, P, layout, refused)
-        self.transform, self.promise = None, replace(NO_PROMISE, spent=self.promise.spent if self.promise else 0.0)
+        spent = self.cost_estimate.spent if self.cost_estimate else 0.0
+        self.transform, self.cost_estimate = None, replace(NO_ESTIMATE, spent=spent)
         return True
 
     def _choose_base(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout) -> float:
@@ -103,13 +105,13 @@ class EntriesTrain:
         lattice = self._places.lattice(P.getSize()[0] // P.getBlockSize())
         product = _product_operations(P, lattice if found is None else layout.digits.shape)
         if found is not None:
-            self.promise = found.promise if found.inverse.kind else None
-            return (1 + found.promise.each) * product * found.promise.iterations
+            self.cost_estimate = found.cost_estimate if found.inverse.kind else None
+            return (1 + found.cost_estimate.each) * product * found.cost_estimate.iterations
         if not multiplies(A) or not is_symmetric(Entries.of(P), P.getSize()[0]):
             return self._iterations * product
         chosen = choose(P, A, product)
         self.transform = chosen.inverse or (None if chosen.scaled else Identity())
-        self.promise = chosen.promise
+        self.cost_estimate = chosen.cost_estimate
         self._iterations = int(min(chosen.iterations, 1e9))
         return chosen.cost * product
 
@@ -227,14 +229,14 @@ class EntriesTrain:
 
     # -- application ----------------------------------------------------------------------------------------
 
-    def distrust(self, why: str) -> None:
+    def note_failure(self, why: str) -> None:
         """A solve failed; the next matrix is tried again."""
         self.failure = why
 
     def leave(self, why: str) -> None:
         """Conjugate gradients are faster without a preconditioner: there is none from now on."""
         self.account.fall_back(why)
-        self.note, self.promise = why, None
+        self.note, self.cost_estimate = why, None
         self.transform, self.compressed, self.inverse = Identity(), None, None
 
     def use(self, dtype: DTypeLike) -> None:

@@ -21,7 +21,7 @@ from scipy import linalg
 from dem.exchange import on_first
 from pctt.mat.entries import Entries, diagonal, diagonal_blocks
 from pctt.pc.mat import conjugate_gradients
-from pctt.tt.conjugate import DIGITS, ConjugateGradients, Promise, iterations
+from pctt.tt.conjugate import DIGITS, ConjugateGradients, CostEstimate, iterations
 from pctt.tt.train import Array
 from pctt.tt.work import ENTRY, MULTIPLY
 
@@ -214,7 +214,7 @@ class Chosen:
         return self.iterations * (1 + self.each)
 
     @property
-    def promise(self) -> Promise | None:
+    def cost_estimate(self) -> CostEstimate | None:
         """What a solve may take; None if conjugate gradients have no preconditioner, or one that makes no difference.
 
         Half of the estimate for none was at most what they took, in all kernels tried with a random right side.
@@ -222,7 +222,7 @@ class Chosen:
         if (self.inverse is None and not self.scaled) or self.iterations == self.alone:
             return None
         least = int(min(0.5 * self.alone, MANY))
-        return Promise(self.each, [1.0, 10 ** (-DIGITS / self.iterations)], [1.0] * (least + 1), self.spent)
+        return CostEstimate(self.each, [1.0, 10 ** (-DIGITS / self.iterations)], [1.0] * (least + 1), self.spent)
 
 
 def estimate(run: ConjugateGradients) -> float:

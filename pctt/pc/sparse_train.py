@@ -44,7 +44,7 @@ class SparseTrain:
         between trials double until the next structure
     """
 
-    note, base, promise = "", "block Jacobi", None
+    note, base, cost_estimate = "", "block Jacobi", None
     single_pays = False
     _product: TrainProduct  # of the inverse in use
 
@@ -237,7 +237,7 @@ class SparseTrain:
         assert self.slots is not None
         return self._product.flops + 4 * self.slots.root.size
 
-    def distrust(self, why: str) -> None:
+    def note_failure(self, why: str) -> None:
         """A solve failed: the next set-up tries another train; with reuse a later one, if this one was new."""
         if self._age:
             self._trial = 0

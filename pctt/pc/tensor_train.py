@@ -191,7 +191,7 @@ class TensorTrain(Context):
             reasons = [f"{made.failure}: {takes_over}", *[NOWHERE] * lost, *[FASTER] * sparse]
             self._warn(self.comm, "; ".join(reasons))
         self._refused = bool(made.failure)
-        self._trials = made.promise.spent if made.promise is not None else 0.0
+        self._trials = made.cost_estimate.spent if made.cost_estimate is not None else 0.0
         if self.rank == 1 and not self.failed:
             self._make_block_jacobi(P)
         set_failed(pc, self.failed)
@@ -260,10 +260,10 @@ class TensorTrain(Context):
         if self.P is not None and self.rank > 1:
             self._last_precision = self._precision(self._is_unharmed(ksp))
             self.made.use(self._last_precision)
-        promise = None if self.P is None or self.failed else self.made.promise
+        cost_estimate = None if self.P is None or self.failed else self.made.cost_estimate
         self._watch = None
-        if promise is not None and Watch.can(ksp, pc):
-            self._watch = Watch(ksp, b, x, promise, self._trials, self.sign)
+        if cost_estimate is not None and Watch.can(ksp, pc):
+            self._watch = Watch(ksp, b, x, cost_estimate, self._trials, self.sign)
             self._trials = 0.0
 
     @staticmethod
@@ -299,13 +299,13 @@ class TensorTrain(Context):
                 what = f"{ksp.getType()} broke down ({reason}) {what}"
                 again = self.options.fallback == "jacobi"
                 self.account.fall_back(f"{what}, solved again with block Jacobi" if again else what)
-                self.made.distrust(self.account.last)
+                self.made.note_failure(self.account.last)
                 self._warn(self.comm, self.account.last)
                 if again:
                     self._solve_again(ksp, b, x)
             elif ksp.getType() not in ("preonly", "richardson"):
                 self.account.fall_back(f"{ksp.getType()} stalled {what}")
-                self.made.distrust(self.account.last)
+                self.made.note_failure(self.account.last)
         self.account.used[self._used()] += 1
 
     def _leave(self, watch: Watch, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:

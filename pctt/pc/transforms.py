@@ -13,7 +13,7 @@ from pctt.mat.entries import Entries, is_symmetric
 from pctt.mat.grid_train import WholeVectors
 from pctt.mat.order import Layout
 from pctt.tt import differences
-from pctt.tt.conjugate import Promise
+from pctt.tt.conjugate import CostEstimate
 from pctt.tt.train import Array
 
 
@@ -21,12 +21,12 @@ class DifferencesInverse:
     """The inverse with which conjugate gradients cost least, of those that fast transforms give, or the identity.
 
     inverse : see `pctt.tt.differences.FastInverse`
-    promise : what trials on parts of the grid have shown
+    cost_estimate : what trials on parts of the grid have shown
     """
 
-    def __init__(self, layout: Layout, inverse: differences.FastInverse, promise: Promise) -> None:
+    def __init__(self, layout: Layout, inverse: differences.FastInverse, cost_estimate: CostEstimate) -> None:
         self.gather, self.order = WholeVectors(layout.comm, layout.counts), layout.rows
-        self.inverse, self.promise = inverse, promise
+        self.inverse, self.cost_estimate = inverse, cost_estimate
 
     @classmethod
     def best_of(cls, P: PETSc.Mat, layout: Layout) -> DifferencesInverse | None:
@@ -49,7 +49,7 @@ class DifferencesInverse:
         if found is None:
             return None
         inverse = differences.FastInverse(a, found.kind)
-        return cls(layout, inverse, found.promise) if comm.bcast(inverse.positive) else None
+        return cls(layout, inverse, found.cost_estimate) if comm.bcast(inverse.positive) else None
 
     def __call__(self, x: Array) -> Array:
         """This rank's part of the product, from its part of x, (n,) or (k, n). Every rank transforms whole vectors."""
@@ -69,7 +69,7 @@ class DifferencesInverse:
     @property
     def iterations(self) -> int:
         """Of conjugate gradients to 1e-8, on a part of the grid."""
-        return self.promise.iterations
+        return self.cost_estimate.iterations
 
     @property
     def flops(self) -> int:

@@ -7,7 +7,7 @@ from math import inf, log10
 from petsc4py import PETSc
 
 from pctt.pc.mat import conjugate_gradients
-from pctt.tt.conjugate import ConjugateGradients, Promise, at_least, iterations
+from pctt.tt.conjugate import ConjugateGradients, CostEstimate, at_least, iterations
 from pctt.tt.train import Array
 
 AT_LEAST = 24.0  # products of trials and a solution that are too few to be watched
@@ -23,7 +23,7 @@ class Watch:
     Once trials and applications have cost GROWTH times what a trial has promised, or AT_LEAST more than conjugate
     gradients alone are known to take, these solve the same system in turns with the KSP, as long as they have cost less
     than it. They wait where residuals show that they need HOPELESS times what the KSP does, and that this is PATIENCE
-    times its promise at most. If they have the solution first, the KSP ends with its next test, and `solution` is
+    times its estimate at most. If they have the solution first, the KSP ends with its next test, and `solution` is
     theirs: if they never waited, all is not more than twice what they take alone, plus AT_LEAST. Costs are counted, not
     measured, and all ranks decide by the same norms.
 
@@ -33,15 +33,17 @@ class Watch:
     products : of conjugate gradients alone so far
     """
 
-    def __init__(self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec, promise: Promise, spent: float, sign: float) -> None:
-        self.ksp, self.promise, self._sign = ksp, promise, sign
+    def __init__(
+        self, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec, cost_estimate: CostEstimate, spent: float, sign: float
+    ) -> None:
+        self.ksp, self.cost_estimate, self._sign = ksp, cost_estimate, sign
         self.solution: Array | None = None
         self._most = ksp.max_it
         self._b, self._start = b, x.array_r.copy() if ksp.getInitialGuessNonzero() else None
         norm = b.norm()
         self._enough = max(ksp.rtol * norm, ksp.atol)
         self._digits = log10(norm / self._enough) if 0 < self._enough < norm else 16.0 if norm else 0.0
-        cost, alone = promise.cost(self._digits), at_least(promise.alone, self._digits)
+        cost, alone = cost_estimate.cost(self._digits), at_least(cost_estimate.alone, self._digits)
         self._trials, self._norms = spent, [0.0]
         self._expected = max(AT_LEAST, min(spent + GROWTH * cost, alone + AT_LEAST))
         self._alone: ConjugateGradients | None = None
@@ -58,7 +60,7 @@ class Watch:
     def count(self) -> None:
         """Collective. PETSc has no norm of this solve before the second application."""
         self._norms.append(self.ksp.getResidualNorm())
-        cost = (len(self._norms) - 1) * (1 + self.promise.each)
+        cost = (len(self._norms) - 1) * (1 + self.cost_estimate.each)
         if len(self._norms) < 3 or self._trials + cost <= self._expected or self.solution is not None:
             return
         if self._alone is None:
@@ -67,7 +69,7 @@ class Watch:
         run, first, last = self._alone, *(self._norms[k] for k in (2, -1))
         gained = log10(first / last) if first > last > 0 else 0.0
         needs = cost * self._digits / gained if gained > 0 else inf
-        lost = HOPELESS * needs if needs <= PATIENCE * self.promise.cost(self._digits) else inf
+        lost = HOPELESS * needs if needs <= PATIENCE * self.cost_estimate.cost(self._digits) else inf
         while run.cost < self._trials + cost and run.norms[-1] > self._enough and not run.failed:
             if self.products >= PROBE and iterations(run.norms, self._digits) > lost:
                 break

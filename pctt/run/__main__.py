@@ -35,13 +35,13 @@ try:
 except ImportError as error:
     sys.exit(str(error))
 
-from dem.together import SceneError, unlike
+from dem.together import SceneError, first_differing_rank
 from pctt.disk import FileError
 from pctt.ksp_options import entered, mark_used, refuse_stray, taken_over
 from pctt.options import OptionError
 from pctt.petsc import options_database
 from pctt.run.help import help_text
-from pctt.run.interrupt import InterruptError, heed
+from pctt.run.interrupt import InterruptError, catch_signals
 from pctt.run.options import read_options
 from pctt.run.settings import DEMO_SOLVERS
 from pctt.run.simulate import simulate, solve_file
@@ -110,9 +110,9 @@ def run() -> int:
     """Exit status: 0; 1 if a scene fails; 2 for a bad option or file; 130, the status of Ctrl-C in shells, if a signal
     has ended the run. One message says what went wrong. Other errors abort all ranks."""
     comm = MPI.COMM_WORLD.Dup()  # a message of a user's scene meets none of ours
-    heed(comm)
+    catch_signals(comm)
     try:
-        if other := unlike(comm, repr((sys.argv[1:], sorted(options_database().items())))):
+        if other := first_differing_rank(comm, repr((sys.argv[1:], sorted(options_database().items())))):
             raise OptionError(f"rank {other} has other options than rank 0; allowed are the same options on all ranks")
         main(comm)
     except tuple(STATUS) as error:

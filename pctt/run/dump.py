@@ -30,8 +30,8 @@ from dem.parts.ends import Constraint
 from dem.scene import kinds_of
 from dem.step.system import ContactSystem
 from pctt import ccp
+from pctt.arrays import Array
 from pctt.ccp import fclib
-from pctt.ccp.cones import Array
 from pctt.disk import FileError
 from pctt.folder import HARD
 from pctt.options import OptionError

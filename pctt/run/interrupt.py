@@ -23,7 +23,7 @@ class InterruptError(RuntimeError):
     """A run that was asked to end; the message says how to go on. Raised on all ranks alike."""
 
 
-def heed(comm: MPI.Comm) -> None:
+def catch_signals(comm: MPI.Comm) -> None:
     """From now on note signals instead of ending by them."""
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -39,6 +39,6 @@ def heed(comm: MPI.Comm) -> None:
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it without a word; PETSc would print a page
 
 
-def asked(comm: MPI.Comm) -> bool:
+def is_requested(comm: MPI.Comm) -> bool:
     """Whether any rank was asked to end; collective."""
     return comm.allreduce(bool(_noted), MPI.LOR)

@@ -9,7 +9,7 @@ import numpy as np
 from dem.arrays import Floats
 from dem.parts.ends import Geometry
 from dem.parts.joints import KINDS, Joint
-from dem.together import meet
+from dem.together import barrier
 from dem.unconstrained.constraints import constraints_now, number_of
 
 
@@ -32,7 +32,7 @@ class JointNow:
     @property
     def _now(self) -> tuple[Joint, Geometry, Floats]:
         """The joint, the geometry of all, and the velocities (6,) of its second end relative to the first."""
-        meet(self._sim.comm, f"joint {self.name}")
+        barrier(self._sim.comm, f"joint {self.name}")
         found, velocity = constraints_now(self._sim.world)
         relative = np.einsum("wsx,sx->w", found.rows[self._number], velocity[self._number])
         return self.motor, found, relative
@@ -51,7 +51,7 @@ class JointNow:
     def drive(self) -> float:
         """Torque [N m] or force [N] of the motor and the limits along the axis, its mean over the last step."""
         joint = self.motor
-        return float(self._impulses[joint.way] / self._sim.settings.dt) if KINDS[joint.kind].motor else 0.0
+        return float(self._impulses[joint.coordinate] / self._sim.settings.dt) if KINDS[joint.kind].motor else 0.0
 
     @property
     def angle(self) -> float:
@@ -72,7 +72,7 @@ class JointNow:
     def speed(self) -> float:
         """Of a hinge [rad/s] or a slider [m/s] in the last step."""
         joint, _, velocity = self._now
-        return float(velocity[joint.way])
+        return float(velocity[joint.coordinate])
 
     @property
     def motor(self) -> Joint:

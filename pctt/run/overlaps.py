@@ -11,7 +11,7 @@ from dem.start.stiffness import expected_overlap
 from dem.start.time_step import DRIVEN, smallest
 from dem.step import Step
 from dem.step.overlaps import overlaps
-from pctt.run.report import mending
+from pctt.run.report import remedy
 from pctt.run.settings import CLOSING, Settings
 
 TWICE = 2.0  #: overlaps are told of that are so many times what is promised
@@ -64,5 +64,5 @@ class OverlapWatch:
         promised = self.springs + self.steps
         return (
             f"step {step}: bodies overlap by {self._worst:.2g} half thicknesses, where up to {promised:.2g} were "
-            f"expected: {CAUSES[cause]}. What helps: {mending(cause, program)}"
+            f"expected: {CAUSES[cause]}. What helps: {remedy(cause, program)}"
         )

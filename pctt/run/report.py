@@ -56,7 +56,7 @@ def option_name(field: str, program: bool) -> str:
     return f"-{'ccp_tol' if field == 'tol' else field}" if program else f"{field}="
 
 
-def mending(field: str, program: bool) -> str:
+def remedy(field: str, program: bool) -> str:
     """How an option of `Settings` has to change that overlaps are smaller."""
     return f"a {'larger' if field == 'stiffness' else 'smaller'} {option_name(field, program)}"
 
@@ -269,7 +269,7 @@ def overlap_line(worst: Mapping[str, float], cause: str = "dt") -> str:
     line = f"worst overlap {overlap:.2g} m, {overlap / radius:.1%} of the smallest radius, at step {worst['step']}"
     if overlap <= LARGE_OVERLAP * radius:
         return line
-    return f"WARNING: {line}; try {mending(cause or 'dt', True)}"
+    return f"WARNING: {line}; try {remedy(cause or 'dt', True)}"
 
 
 def figure_table(figures: Mapping[str, float]) -> str:

@@ -24,11 +24,11 @@ from dem.arrays import Floats
 from dem.compiled import loop
 from dem.exchange import reduced
 from dem.model.world import World
-from dem.record import energy
+from dem.record.energies import energy
 from dem.step.islands import contacts_at_rest
 from dem.step.system import ContactSystem
+from pctt.arrays import Array
 from pctt.ccp import ConeProblem, Limits, Result, with_part
-from pctt.ccp.cones import Array
 
 Solve = Callable[[ConeProblem, Array, Limits], Result]
 
@@ -73,8 +73,9 @@ def with_islands(
 
 
 def account(world: World, limits: Limits, result: Result) -> None:
-    """Count what a step has spent beyond its limits, if it did not reach the aim; a step that does may spend all."""
-    if limits.spare and result.residual <= limits.aimed:
+    """Count what a step has spent beyond its limits if these iterations did not reach the aim; a step whose do may
+    spend all. Few contacts reach it by the conic method otherwise."""
+    if limits.spare and result.residual <= limits.aimed and not result.newton_its:
         world.spare = SPARE
     else:
         world.spare = min(SPARE, world.spare - result.beyond + SHARE * result.iterations)

@@ -11,7 +11,7 @@ from typing import Any, Optional
 
 import numpy as np
 
-from dem.experiment import SCENE_FILE, Experiment, Given, SceneFileError, from_file
+from dem.experiment import SCENE_FILE, Experiment, SceneExperiment, SceneFileError, from_file
 from dem.scene import Scene
 from dem.start import time_step
 from pctt import ccp
@@ -256,6 +256,6 @@ def scene_name(scene: Experiment) -> str:
     """How results name a scene: as the program does, a file of the user's without folder and suffix."""
     kind = type(scene)
     names = [name for name, known in SCENES.items() if known is kind]
-    if isinstance(scene, Given):
+    if isinstance(scene, SceneExperiment):
         return "scene"
     return names[0] if names else kind.__module__.removeprefix(SCENE_FILE) if scene.digest else kind.__name__

@@ -10,8 +10,8 @@ from mpi4py import MPI
 
 from dem.compiled import tell_first_compilation
 from pctt import ccp, log
+from pctt.arrays import Array
 from pctt.ccp import fclib
-from pctt.ccp.cones import Array
 from pctt.ccp.fclib import FileFormatError, Stored
 from pctt.disk import FileError, on_first, write_text
 from pctt.folder import dumps
@@ -81,7 +81,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         progress.doing(sim.steps, sim.time, end)
 
     progress.doing(sim.steps, sim.time, end)
-    sim.run(steps=steps, call=say, stop=lambda sim: interrupt.asked(sim.comm))
+    sim.run(steps=steps, call=say, stop=lambda sim: interrupt.is_requested(sim.comm))
     if sim.steps < end:
         words = _how_to_go_on(options, output.checkpoint, end - sim.steps)
         raise interrupt.InterruptError(f"interrupted after step {sim.steps}; the same command with {words}")

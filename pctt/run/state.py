@@ -20,7 +20,7 @@ from mpi4py import MPI
 from dem.arrays import Floats
 from dem.bodies import Bodies
 from dem.exchange import refuse
-from dem.experiment import Experiment, Given
+from dem.experiment import Experiment, SceneExperiment
 from dem.mesh import Mesh
 from dem.model.changes import changes, restore
 from dem.model.world import World
@@ -29,7 +29,7 @@ from dem.scene import LargeBody, Scene
 from dem.shapes import placed
 from dem.start import even_slice, new_world, refuse_overlap, restart_rows, restored_world, stiffness, time_step
 from dem.step.impulses import ImpulseMemory
-from dem.together import SceneError, together, unlike
+from dem.together import SceneError, first_differing_rank, together
 from pctt import ccp
 from pctt.disk import FileError, Lock, on_first, read, same_rows, texts, write_rows
 from pctt.options import OptionError
@@ -57,7 +57,7 @@ def built(scene: Experiment, comm: MPI.Comm) -> Scene:
     what = f"build of the scene {type(scene).__name__}"
     found = together(comm, what, build)
     words, numbers = together(comm, what, lambda: _facts(found))
-    if other := unlike(comm, words, numbers):
+    if other := first_differing_rank(comm, words, numbers):
         allowed = "allowed is the same scene on all ranks (random numbers need a seed, and no rank a part of its own)"
         raise SceneError(f"{what}: rank {other} has built other bodies or materials than rank 0; {allowed}")
     found.survey(comm)
@@ -90,7 +90,7 @@ def _numeric(value: Any) -> bool:
 
 def scene_words(experiment: Experiment) -> str:
     """What messages call a scene."""
-    return "the scene" if isinstance(experiment, Given) else f"scene {scene_name(experiment)}"
+    return "the scene" if isinstance(experiment, SceneExperiment) else f"scene {scene_name(experiment)}"
 
 
 def world_at_start(
@@ -166,7 +166,7 @@ def save(path: Path, made_with: dict[str, Any], world: World, memory: ImpulseMem
 
 
 @dataclasses.dataclass(frozen=True)
-class Kept:
+class RunState:
     """The state of a run on this rank, in the place of a checkpoint: arrays that no step changes."""
 
     local: dict[str, np.ndarray]  #: rows of grains
@@ -175,13 +175,13 @@ class Kept:
     impulses: tuple[np.ndarray, ...]  #: keys and impulses of the last step's contacts
 
 
-def kept(world: World, memory: ImpulseMemory) -> Kept:
+def run_state(world: World, memory: ImpulseMemory) -> RunState:
     """The state of a world now."""
     local, replicated = ({name: array.copy() for name, array in arrays.items()} for arrays in world.state())
-    return Kept(local, replicated, changes(world), tuple(array.copy() for array in memory.state()))
+    return RunState(local, replicated, changes(world), tuple(array.copy() for array in memory.state()))
 
 
-def restored(kept: Kept, scene: Scene, comm: MPI.Comm, times: float = 1.0) -> tuple[World, ImpulseMemory]:
+def restored(kept: RunState, scene: Scene, comm: MPI.Comm, times: float = 1.0) -> tuple[World, ImpulseMemory]:
     """The world and the impulses, so many ``times`` as great, of a state of the scene on as many ranks; collective.
     ValueError and others for what is none."""
     world = restored_world(scene, comm, kept.local, kept.replicated)
@@ -226,7 +226,7 @@ def load(
     _refuse_other_origin(path, old, scene_of, made_with, program)
     times = 1.0 if old["dt"] == made_with["dt"] else made_with["dt"] / old["dt"]
     try:
-        found = restored(Kept(local, replicated, changed, impulses), scene, comm, times)
+        found = restored(RunState(local, replicated, changed, impulses), scene, comm, times)
     except (AttributeError, KeyError, TypeError, ValueError) as error:  # of another scene file
         raise OptionError(f"{'-restart ' * program}{path}: {error}") from None
     _tell_other_origin(path, old, made_with, comm)
@@ -332,14 +332,14 @@ def settled_state(
             say(f"{error}; it is made anew")
             anew = True
     on_first(comm, path.parent, lambda: path.parent.mkdir(parents=True, exist_ok=True))
-    with _alone(path, comm, say):
+    with _exclusive(path, comm, say):
         if anew or not comm.bcast(path.exists()):
             _settle(path, made_with, experiment, settings, scene, comm, say)
     return path
 
 
 @contextmanager
-def _alone(path: Path, comm: MPI.Comm, say: Say) -> Iterator[None]:
+def _exclusive(path: Path, comm: MPI.Comm, say: Say) -> Iterator[None]:
     """Other runs that settle the same scene have ended, and wait for the end of the block; collective."""
     lock, waits = Lock(path.with_suffix(".lock")), False
     try:
@@ -347,7 +347,7 @@ def _alone(path: Path, comm: MPI.Comm, say: Say) -> Iterator[None]:
             if not waits:
                 say(f"waits for another run that settles the same scene, {path}")
             waits = True
-            if interrupt.asked(comm):
+            if interrupt.is_requested(comm):
                 raise interrupt.InterruptError("interrupted while another run settled the scene")
             time.sleep(0.2)
         yield
@@ -384,7 +384,7 @@ def _settle(
             made = stepper.step()
             stepper.take(made)
             line = made.figures
-            interrupted = interrupt.asked(comm)
+            interrupted = interrupt.is_requested(comm)
             if world.step % tenth == 0 or world.step == end or interrupted:
                 save(unfinished(path), made_with, world, memory)
                 say(

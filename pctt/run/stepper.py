@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -13,10 +13,10 @@ from mpi4py import MPI
 from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
 from dem.exchange import reduced
-from dem.model.images import put_back
+from dem.model.images import wrap
 from dem.model.partition import rebalance
 from dem.model.world import World
-from dem.record.passage import come_and_go
+from dem.record.passage import insert_and_remove
 from dem.step import Step, advance, carried, find_overrun, find_turned
 from dem.step.fast import refuse_passages
 from dem.step.impacts import in_order
@@ -25,11 +25,14 @@ from dem.step.system import ContactSystem, contact_frames
 from dem.together import SceneError
 from dem.unconstrained import unconstrained
 from pctt import ccp, log
-from pctt.ccp.cones import Array, Cones
+from pctt.arrays import Array
+from pctt.ccp.cones import Cones
 from pctt.options import OptionError
 from pctt.run import rest
-from pctt.run.dump import Dump
-from pctt.run.settings import Settings
+
+if TYPE_CHECKING:
+    from pctt.run.dump import Dump
+    from pctt.run.settings import Settings
 
 TRIES = 3  #: linearisations of turned contacts in a step, and of limits and motors that contacts have shown
 
@@ -39,7 +42,7 @@ class NoSolutionError(SceneError):
 
 
 @dataclass(frozen=True)
-class Made:
+class NewStep:
     """A step that is made, and whose world no `Stepper` has taken yet."""
 
     step: Step  #: its world is that at the end of the step
@@ -79,28 +82,28 @@ class Stepper:
         if self.newton is not None:
             self.newton.destroy()
 
-    def step(self) -> Made:
+    def step(self) -> NewStep:
         """Make a step of dt; the world stays as it is until `take`. SceneError if a body is lost (its position is no
         number), if code of the scene fails, or if the contacts have no solution: any impulses would be invented, and
         those of the solver throw bodies away."""
         try:
-            return self._made(self.world.trial())
+            return self._next_step(self.world.trial())
         except FloatingPointError as error:  # raised on all ranks alike
             raise SceneError(f"step {self.world.step + 1}: {error}") from None
 
-    def take(self, made: Made) -> None:
+    def take(self, made: NewStep) -> None:
         """Let the world and the memory be those at the end of this step."""
         system = made.step.system
         self.world.take(made.step.world)
         self.memory.remember(system.key, made.held, system.frame, made.kept)
         self._slabs = self.world.slabs
 
-    def _made(self, world: World) -> Made:
+    def _next_step(self, world: World) -> NewStep:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
         given, found, result, eased, smooth, turned, shown = self.settings, None, None, None, False, 0, 0
         with log.phase("search"):
-            come_and_go(world)  # grains that leave, and those that are due
-            put_back(world)  # into the periodic cell
+            insert_and_remove(world)  # grains that leave, and those that are due
+            wrap(world)  # into the periodic cell
             rebalance(world)
             free = unconstrained(world, given.dt)  # gravity, spin, loads, springs, drives, motions
             contacts = in_order(world, find_contacts(world, given.delta, free), free)
@@ -139,7 +142,7 @@ class Stepper:
             advance(world, free, contacts, velocity, system.kept(velocity))
             step = Step(world, contacts, system, *system.parts(result.impulse))
             held, kept = system.held_after(result.impulse), system.keep(world, result.impulse, result.momentum)
-        return Made(step, self._figures(world, problem.size, result, files), held, kept)
+        return NewStep(step, self._figures(world, problem.size, result, files), held, kept)
 
     def _recalled(self, world: World, contacts: Contacts) -> tuple[Array, Array]:
         """The impulses (parts nc, 3) of the last step of these contacts, and what laws kept of them (nc, columns)."""
@@ -154,15 +157,21 @@ class Stepper:
         settings = self.settings
         with log.phase("solve"):
             limits = rest.limits_of(settings.limits, world, system)
-            result = self._by(problem, guess, limits)
+            result = self._by(problem, guess, limits, self.newton)
             rest.account(world, limits, result)
-            result = rest.with_islands(world, system, problem, guess, limits, self._by, result)
+            result = rest.with_islands(world, system, problem, guess, limits, self._by_itself, result)
         return result if before is None else result.after(before)
 
-    def _by(self, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits) -> ccp.Result:
+    def _by(
+        self, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits, newton: ccp.Newton | None
+    ) -> ccp.Result:
         """What the method of the settings makes of a problem."""
         settings = self.settings
-        return ccp.solve(problem, guess, settings.solver, limits, settings.options, self.newton, settings.law)
+        return ccp.solve(problem, guess, settings.solver, limits, settings.options, newton, settings.law)
+
+    def _by_itself(self, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits) -> ccp.Result:
+        """The same of a part of the problem of a step."""
+        return self._by(problem, guess, limits, None if self.newton is None else self.newton.of_parts)
 
     def _missed(
         self, world: World, system: ContactSystem, velocity: Array, turned: int

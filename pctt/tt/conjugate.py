@@ -136,7 +136,7 @@ def race(runs: Sequence[ConjugateGradients], slack: float, most: float, digits: 
 
 
 @dataclass(frozen=True)
-class Promise:
+class CostEstimate:
     """What a trial has shown of a preconditioner.
 
     each : the cost of an application, that of a product with the matrix is 1
@@ -162,4 +162,4 @@ class Promise:
 
 
 #: Nothing is known of a preconditioner.
-NO_PROMISE = Promise(0.0, [1.0, 0.0], [1.0])
+NO_ESTIMATE = CostEstimate(0.0, [1.0, 0.0], [1.0])

@@ -31,7 +31,7 @@ from math import inf, prod
 import numpy as np
 from scipy import fft
 
-from pctt.tt.conjugate import ConjugateGradients, Promise, at_least, race
+from pctt.tt.conjugate import ConjugateGradients, CostEstimate, at_least, race
 from pctt.tt.train import Array
 
 FLOOR = 1e-13  # smaller eigenvalues, relative to the largest, count as rounding
@@ -364,7 +364,7 @@ class Choice:
     """The preconditioner with which a solution costs least, and what trials on parts of the grid have shown."""
 
     kind: Kind
-    promise: Promise
+    cost_estimate: CostEstimate
 
 
 def lines(a: Differences, width: int) -> list[Differences]:
@@ -423,7 +423,7 @@ def choose(a: Differences) -> Choice | None:
     """
     if max(a.aperiodic) <= 1e-12:  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
-        return Choice(CIRCULANT, Promise(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
+        return Choice(CIRCULANT, CostEstimate(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
     kinds, size, trials, scores = candidates(a), prod(a.shape), list[_Trial](), dict[Kind, float]()
     for pieces, least in ((lines(a, 1), 0), (lines(a, 2), 0), (parts(a), 2)):
         kinds = [kind for kind in kinds if not scores or scores[kind] <= OUT * scores[kinds[0]]]
@@ -446,10 +446,10 @@ def choose(a: Differences) -> Choice | None:
     found = kinds[0]
     if not trials:
         inverse = FastInverse(a, found)
-        return Choice(found, Promise(inverse.each, UNTRIED, [1.0])) if inverse.positive else None
+        return Choice(found, CostEstimate(inverse.each, UNTRIED, [1.0])) if inverse.positive else None
     hard = max(trials, key=lambda trial: trial.costs[found]).runs[found]
     alone = max((trial.runs[NOTHING].norms for trial in trials if NOTHING in trial.runs), key=at_least)
-    return Choice(found, Promise(hard.each, hard.norms, alone, _spent(trials, size)))
+    return Choice(found, CostEstimate(hard.each, hard.norms, alone, _spent(trials, size)))
 
 
 def _spent(trials: Sequence[_Trial], size: int) -> float:

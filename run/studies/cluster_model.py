@@ -121,7 +121,7 @@ def seconds_of_boxes(world: World, ranks: int) -> float:
     radius = bodies.bounding_radius(grains) + of_lists
     parts = [(grains.position[a:b], radius[a:b]) for a, b in zip(ends, ends[1:])]
     boxes = np.stack([neighbourhood.chunk_boxes(*part, 8) for part in parts])
-    return least_seconds(lambda: neighbourhood.touched(*parts[-1], boxes[:-1]), 3)
+    return least_seconds(lambda: neighbourhood.seen_by(*parts[-1], np.zeros((1, 3)), boxes[:-1]), 3)
 
 
 def least_seconds(do: Callable[[], object], repeat: int) -> float:

@@ -17,9 +17,9 @@ import siconos_text
 from mpi4py import MPI
 from shared import called_from, parser
 
+from pctt.arrays import Array
 from pctt.blocks import square_block_matrix
 from pctt.ccp import ConeProblem, fclib
-from pctt.ccp.cones import Array
 from pctt.ccp.fclib import FileFormatError, symmetric_blocks, symmetric_masses
 
 #: Of masses in Siconos' files, as `symmetric_masses` takes it: %g and %e print six and seven digits.

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
-import subprocess
 from collections.abc import Callable
 from math import inf
 
@@ -21,7 +19,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from scipy import fft, special
-from shared import ROOT, Row, markdown, parser, record, say_machine
+from shared import ROOT, Row, commit, markdown, parser, record, replace_section, say_machine
 from solutions import COLUMNS, RTOL, WAYS, Array, System, solve, verdict, why_not
 
 from pctt.tt.differences import Differences
@@ -314,15 +312,12 @@ def write_page(found: dict[str, dict[str, Row]], said: dict[str, list[str]], abo
         took = rows["auto"]["what"].partition(" of a grid")[0].removesuffix(" transform")
         lines.append([WORDS[name], *cells[:1], *cells[2:], took])  # without Jacobi, which is the same as none
     heads = ["kernel", *(head for way, head in WAYS.items() if way != "jacobi"), "auto took"]
-    commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
     points = [f"- {words}: {line}" for words, part in said.items() for line in part]
     section = TEXT.format(
         table=markdown(heads, lines), said="\n".join(points), columns=COLUMNS, rtol=RTOL, most=MOST, cpu=about["cpu"],
-        commit=commit.stdout.strip(),
+        commit=commit(),
     )  # fmt: skip
-    before, _, after = PAGE.read_text("utf-8").partition(HEAD)
-    PAGE.write_text(before + HEAD + section + after[re.search("^## ", after, re.MULTILINE).start() :], "utf-8")
-    print(PAGE)
+    replace_section(PAGE, HEAD, section)
 
 
 TEXT = """`run/study kernels` writes this section: CG to a true residual of {rtol:g}, the same matrices and right

@@ -8,6 +8,7 @@ import math
 import multiprocessing
 import os
 import platform
+import re
 import statistics
 import subprocess
 import tempfile
@@ -71,6 +72,19 @@ def record(name: str, about: Row, rows: list[Row]) -> None:
     path = Path("results") / f"{name}.json"
     path.write_text(json.dumps({"machine": about, "rows": rows}, indent=1) + "\n")
     print(path)
+
+
+def commit() -> str:
+    """The commit of the checkout, "dirty" if files have changed since."""
+    words = ["git", "describe", "--always", "--dirty"]
+    return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+
+
+def replace_section(page: Path, head: str, text: str) -> None:
+    """Write the text of a section of a page, which goes from its head to the next of that level."""
+    before, _, after = page.read_text("utf-8").partition(head)
+    page.write_text(before + head + text + after[re.search("^## ", after, re.MULTILINE).start() :], "utf-8")
+    print(page)
 
 
 class Table:

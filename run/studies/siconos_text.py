@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse as sp
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.fclib import FileFormatError, in_space
 
 

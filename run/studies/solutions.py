@@ -178,9 +178,10 @@ def solve(given: System, way: str, rank: str | None = None, most: int = 4000) ->
             ours = ksp.pc.getPythonContext()
             made, applied = ours.made, ours.apply
             what = made.words() if ours.rank > 1 else "block Jacobi"
-            parts = getattr(made.transform, "promise", None)  # of the grid; other trials multiply by the matrix
+            parts = getattr(made.transform, "cost_estimate", None)  # of the grid; other trials multiply by the matrix
             trials = tried + (0.0 if parts is None else parts.spent)
-            each = made.promise.each if made.promise is not None else 0.0 if ours.rank == 1 or way == "auto" else np.nan
+            known = 0.0 if ours.rank == 1 or way == "auto" else np.nan
+            each = known if made.cost_estimate is None else made.cost_estimate.each
 
             def apply(pc: PETSc.PC, r: PETSc.Vec, z: PETSc.Vec) -> None:
                 inner.count += 1

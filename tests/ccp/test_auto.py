@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -36,7 +38,7 @@ def test_auto_goes_over_to_conic_where_apgd_takes_long(law, contacts, tol, monke
     monkeypatch.setattr(by_elimination, "FEW", 100)
     options, coulomb, few = Auto(few=1.0, patience=0.3), law == ccp.COULOMB, contacts == 40
     result = solve("auto", tol, options=options, law=law, contacts=contacts)
-    begun = options.iterations(contacts, tol, coulomb, few=few)
+    begun = options.iterations(from_graph(*heap(contacts=contacts, bodies=contacts // 5), SELF), tol, coulomb, few)
     words = [f"apgd: {begun} iterations", "conic: ", "apgd: "][: 3 if coulomb and not few else 2]
     assert result.converged, result.reason
     parts = result.reason.split("; ")
@@ -66,7 +68,9 @@ def test_much_friction_is_solved_in_turns():
 
 
 def test_the_iterations_of_apgd_grow_with_size_and_accuracy():
-    of = Auto().iterations
+    def of(contacts, *more, **few):
+        return Auto().iterations(SimpleNamespace(size=contacts, comm=SELF), *more, **few)
+
     assert of(40, 1e-4, False) < of(40, 1e-8, False) < of(9000, 1e-8, False) < of(9000, 1e-8, True)
     assert 8411 < of(9000, 1e-4, True) < 22_000 / 2  # a rigid bed of 80 layers: its hardest step, and half of `conic`
     assert of(10, 1e-6, False) == of(300, 1e-6, False)  # small problems have fixed costs

@@ -214,6 +214,10 @@ def test_apgd_begins_in_single_precision_and_ends_in_double(size, monkeypatch):
         return descend(progress, *arguments)
 
     monkeypatch.setattr(apgd, "_descend", watched)
+    ccp.solve(problem, type="apgd", limits=Limits(1e-12), law=ccp.RELAXATION)
+    assert stages == [np.float64]  # few contacts stay in the cache
+    monkeypatch.setattr(apgd, "CACHED", 0)
+    stages.clear()
     result = ccp.solve(problem, type="apgd", limits=Limits(1e-12), law=ccp.RELAXATION)
     assert stages == [np.float32, np.float64]
     assert result.converged

@@ -9,7 +9,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from dem import quaternion
-from dem.contact.polyhedra import FLUSH, ROUND, SNAP, Polyhedra, hulls_of, polyhedra_polyhedra
+from dem.contact.polyhedra import FLUSH, Polyhedra, hulls_of, polyhedra_polyhedra
+from dem.contact.simplex import ROUND, SNAP
 
 DELTA = 0.1
 BOXES = hulls_of(())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import subprocess
@@ -15,6 +16,7 @@ from cases import random_quaternions
 from numba.core.caching import CompileResultCacheImpl
 
 import dem
+import pctt
 from dem import quaternion
 from dem.arrays import places
 from dem.bodies import SPHERE
@@ -226,6 +228,14 @@ def test_a_loop_runs_where_numba_may_not_compile(monkeypatch):
         return 2.0 * x
 
     assert doubled(3.0) == 6.0
+
+
+def test_a_loop_has_nine_parameters_at_most():
+    for path in (file for folder in (dem, pctt) for file in Path(folder.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            marks = {ast.unparse(mark) for mark in getattr(node, "decorator_list", ())}
+            if marks & {"loop", "inlined"}:
+                assert len(node.args.args + node.args.kwonlyargs) <= 9, f"{path.name}: {node.name}"
 
 
 @pytest.mark.parametrize("order", ["the same", "with gaps", "reversed", "random", "none in common", "empty"])

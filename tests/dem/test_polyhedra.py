@@ -12,7 +12,8 @@ from dem import quaternion
 from dem.bodies import POLYHEDRON
 from dem.contact import find_contacts
 from dem.contact.narrow import CORNERS, Spheres
-from dem.contact.polyhedra import FLUSH, ROUND, SNAP, Polyhedra, hulls_of, polyhedra_polyhedra, spheres_polyhedra
+from dem.contact.polyhedra import FLUSH, Polyhedra, hulls_of, polyhedra_polyhedra, spheres_polyhedra
+from dem.contact.simplex import ROUND, SNAP
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.shapes.polyhedra import solid

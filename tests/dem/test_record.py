@@ -19,7 +19,7 @@ from dem.motion import Glide, Guided, Hinged
 from dem.scene import Scene
 from dem.shapes import Plane, Sphere
 from dem.start import new_world
-from dem.step import advance
+from dem.step import Step, advance
 from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
@@ -34,7 +34,7 @@ def made(world, solve=crude_impulse, dt=DT, delta=0.02):
     system = ContactSystem(world, contacts, unconstrained(world, dt), recovery_speed=0.5)
     impulse = solve(system)
     advance(world, system.motion, system.contacts, system.velocity(impulse))
-    return record.Step(world, contacts, system, impulse)
+    return Step(world, contacts, system, impulse)
 
 
 def energy_error(balance, before):

@@ -51,6 +51,20 @@ def test_grain_that_crosses_takes_the_velocity_of_the_other_side():
     np.testing.assert_allclose(sim.positions[0, :2], [np.mod(0.1 + 0.06 - 0.2, 0.5), 0.2], atol=1e-12)
 
 
+def test_grain_that_has_crossed_keeps_its_velocity_as_the_shear_and_the_cell_change():
+    """No force acts on it, whether it is put back into the cell yet or not."""
+    scene = Scene(0.3, (0.0, 0.0, 0.0), stiffness=1e4, period=(0.5,) * 3, shear_rate=2.0, strain_rate=(0.05, -0.1, 0.0))
+    scene.add_spheres([[0.1, 0.1, 0.1]], radius=0.05, density=1000.0, velocity=(0.3, 2.1, 0.0))
+    sim = pctt.Simulation(scene, dt=0.01)
+    sim.run(steps=20)
+    assert 0.5 < sim.world.grains.position[0, 1] < 0.6
+    expected = sim.velocities
+    sim.run(steps=2)
+    np.testing.assert_allclose(sim.velocities, expected, atol=1e-12)
+    sim.change("cell", shear_rate=0.5)
+    np.testing.assert_allclose(sim.velocities, expected, atol=1e-12)
+
+
 def test_affine_flow_keeps_its_profile():
     height = np.array([0.05, 0.2, 0.35, 0.5, 0.65])
     scene = Scene(0.3, (0.0, 0.0, 0.0), period=(0.5, 0.75, None), shear_rate=4.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dem.together import unlike
+from dem.together import first_differing_rank
 
 
 @pytest.mark.parallel(2, 3)
@@ -17,15 +17,15 @@ def test_the_rank_with_other_words_or_numbers_is_found():
     changed = x.copy()
     changed[437] += 1e-3 * odd
     many = [np.zeros(3 + odd)] if comm.rank else [np.zeros(3)]
-    assert unlike(comm, "a", [x, np.inf * x]) == 0
-    assert unlike(comm, "ab"[odd]) == last
-    assert unlike(comm, "a", [x, changed]) == last
-    assert unlike(comm, "a", many) == last
-    assert unlike(comm, "a", [x] * (1 + odd)) == last
-    assert unlike(comm, "a", [np.where(np.arange(1000) == odd, np.inf, x)]) == last
+    assert first_differing_rank(comm, "a", [x, np.inf * x]) == 0
+    assert first_differing_rank(comm, "ab"[odd]) == last
+    assert first_differing_rank(comm, "a", [x, changed]) == last
+    assert first_differing_rank(comm, "a", many) == last
+    assert first_differing_rank(comm, "a", [x] * (1 + odd)) == last
+    assert first_differing_rank(comm, "a", [np.where(np.arange(1000) == odd, np.inf, x)]) == last
 
 
 @pytest.mark.parallel(2)
 def test_the_last_bits_of_another_processor_are_no_difference():
     x = np.random.default_rng(0).normal(size=100_000)
-    assert unlike(MPI.COMM_WORLD, "", [x * (1.0 + 2e-16 * MPI.COMM_WORLD.rank)]) == 0
+    assert first_differing_rank(MPI.COMM_WORLD, "", [x * (1.0 + 2e-16 * MPI.COMM_WORLD.rank)]) == 0

@@ -12,7 +12,7 @@ import pytest
 from pctt.disk import FileError
 from pctt.export import write_single
 from pctt.folder import Folder
-from pctt.look.program import told_steps
+from pctt.look.program import described_steps
 
 
 def held(path):
@@ -86,7 +86,7 @@ def test_missing_frames_are_told_and_what_is_no_file_is_left_alone(folder, tmp_p
     (whole / "frames" / "000003.h5").unlink()
     run = Folder(whole)
     run.require_frames()
-    assert told_steps(run, [2, 4]) == "2 of 3 recorded steps (missing: 3)"
+    assert described_steps(run, [2, 4]) == "2 of 3 recorded steps (missing: 3)"
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(FileError, match="pipe: cannot write .it is no regular file"):
         write_single(tmp_path / "pipe", run, [2, 4])

@@ -13,7 +13,7 @@ from train_solver import context, dense_of, operator, ready, report, shell, solv
 from pctt.mat import from_differences
 from pctt.pc.watch import AT_LEAST, PROBE
 from pctt.tt import differences as of
-from pctt.tt.conjugate import Promise
+from pctt.tt.conjugate import CostEstimate
 
 GRID = (10, 7)
 SIZE = 70
@@ -128,7 +128,7 @@ def waves(s: np.ndarray) -> np.ndarray:
 
 def promised(kind: of.Kind, norms: list[float], alone: list[float]):
     """A choice of this preconditioner, whether it is good or not."""
-    return lambda a: of.Choice(kind, Promise(of.FastInverse(a, kind).each, norms, alone))
+    return lambda a: of.Choice(kind, CostEstimate(of.FastInverse(a, kind).each, norms, alone))
 
 
 @pytest.mark.parallel(1, 2, 3)

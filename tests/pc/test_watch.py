@@ -10,7 +10,7 @@ from train_solver import context, ready, report, shell
 from pctt.mat import from_differences
 from pctt.pc.watch import AT_LEAST
 from pctt.tt import differences as of
-from pctt.tt.conjugate import Promise
+from pctt.tt.conjugate import CostEstimate
 
 SIZE = 900  # unknowns of the dense matrices
 CHOOSE = of.choose
@@ -128,8 +128,8 @@ def test_a_preconditioner_that_turns_out_wrong_costs_as_much_as_none_again(name,
     ksp = ready(A, rank=rank, rtol=rtol)
     ksp.setTolerances(rtol=rtol, max_it=5000)
     assert words in report(ksp)
-    promise = context(ksp).made.promise
-    on_parts = promise.spent if name == "transform" else 0.0
+    cost_estimate = context(ksp).made.cost_estimate
+    on_parts = cost_estimate.spent if name == "transform" else 0.0
     spoil(ksp, name)
     solved(ksp, b, rtol)
     assert on_parts + len(found) <= 2 * alone + AT_LEAST
@@ -149,9 +149,9 @@ def test_a_wrong_choice_costs_twice_as_much_as_none(kind, entries, monkeypatch):
     """What the trial shows of it is wrong, what it shows of none is not."""
 
     def wrong(a: of.Differences) -> of.Choice:
-        honest = CHOOSE(a).promise
+        honest = CHOOSE(a).cost_estimate
         each = of.FastInverse(a, kind).each
-        return of.Choice(kind, Promise(each, [1.0, 1e-1, 1e-8], honest.alone, honest.spent))
+        return of.Choice(kind, CostEstimate(each, [1.0, 1e-1, 1e-8], honest.alone, honest.spent))
 
     monkeypatch.setattr(of, "choose", wrong)
     A = from_differences(entries, (60, 50))
@@ -168,7 +168,7 @@ def test_trials_may_have_cost_more_than_none(monkeypatch):
     """Then none are in turns from the first norm of a residual that PETSc knows."""
 
     def dear(a: of.Differences) -> of.Choice:
-        return of.Choice(of.COSINE, Promise(0.25, [1.0, 1e-8], [1.0], 1000.0))
+        return of.Choice(of.COSINE, CostEstimate(0.25, [1.0, 1e-8], [1.0], 1000.0))
 
     monkeypatch.setattr(of, "choose", dear)
     A = from_differences(smooth, (60, 50))

@@ -89,9 +89,10 @@ def cradle(gap, e, floor, dt=0.01, count=5, radius=0.05):
 
 
 @pytest.mark.parametrize("floor", [False, True])
-@pytest.mark.parametrize("gap", [1e-4, 1e-3, 5e-3])
+@pytest.mark.parametrize("gap", [1e-4, 1e-3, 5e-3, 5e-3 * (1 - 1e-9), 5e-3 * (1 + 1e-12), 5e-3 * (1 + 1e-9)])
 def test_balls_in_a_row_hand_the_impact_on_within_a_step(gap, floor):
-    """10 mm a step: the last one leaves with the speed of the first, and no energy is lost."""
+    """10 mm a step: the last one leaves with the speed of the first, and no energy is lost. With gaps of half of that,
+    balls touch at the end of a step, but for rounding."""
     np.testing.assert_allclose(cradle(gap, 1.0, floor), [0, 0, 0, 0, 1], atol=1e-3)
 
 

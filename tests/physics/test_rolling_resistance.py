@@ -75,6 +75,27 @@ def test_a_sphere_on_an_incline_rolls_above_rho_over_r():
             assert sim.velocities[0, 0] == pytest.approx(max(exact, 0.0), rel=1e-7, abs=1e-9)
 
 
+def test_coefficients_are_times_the_effective_radius():
+    """1 / (1/r + 1/r'): r on what is flat. Two spheres that roll on each other have the moment of both."""
+    with pytest.raises(ValueError, match="rolling, a length, and rolling_coefficient.*give one"):
+        Scene(0.6, rolling=0.01, rolling_coefficient=0.1)
+    for radius in (R, 3 * R):
+        scene = Scene(0.6, rolling_coefficient=0.05, spinning_coefficient=0.02)
+        scene.add_body("plane", [Plane((0, 0, 1))])
+        spin = (0, 0.5 / radius, 3.0)
+        scene.add_spheres([[0, 0, radius]], radius, DENSITY, velocity=(0.5, 0, 0), angular_velocity=spin)
+        with pctt.Simulation(scene, dt=0.01, **EXACT) as sim:
+            sim.run(steps=10)
+            assert sim.velocities[0, 0] == pytest.approx(0.5 - 5 / 7 * G * 0.05 * sim.time, rel=1e-5)
+            assert sim.velocities[0, 5] == pytest.approx(3.0 - 2.5 * 0.02 * G / radius * sim.time, rel=1e-5)
+    scene = Scene(0.6, gravity=(0, 0, 0), rolling_coefficient=0.05)
+    scene.add_spheres([[0, 0, 0], [4 * R, 0, 0]], [R, 3 * R], DENSITY)
+    with pctt.Simulation(scene, dt=0.01, **EXACT) as sim:
+        sim.step()
+        found = sim.last.system.resistance
+        assert found.most[0] * found.length == pytest.approx(0.05 * 0.75 * R, rel=1e-12)
+
+
 def test_the_relaxation_opens_what_rolls():
     rho, v, dt = 0.004, 0.5, 0.01
     scene = on_a_plane(rolling=rho, velocity=(v, 0, 0), angular_velocity=(0, v / R, 0))

@@ -72,6 +72,23 @@ def test_bodies_that_keep_apart_are_left_alone():
     assert find_turned(world, free, contacts, np.nan * velocity, 0.01 * RADIUS, np.inf, 0) is None
 
 
+def test_what_springs_bear_is_no_reason_to_solve_a_step_again():
+    """Capsules that turn on a soft, smooth floor have sunk into it by more than the overlap that is let pass."""
+    scene = Scene(0.0, stiffness=3e6)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    lying = (np.sqrt(0.5), 0, np.sqrt(0.5), 0)
+    scene.add_capsules((0, 0, RADIUS), RADIUS, 2 * RADIUS, 1000.0, quaternions=lying, angular_velocity=(0, 0, 5))
+    sim = simulation_of(scene)
+    sim.run(steps=40)
+    world, depth = sim.world, 1e-5 * RADIUS
+    free, velocity = unconstrained(world, DT), np.concatenate([world.grains.velocity, np.zeros((1, 6))])
+    contacts = find_contacts(world, DELTA, free)
+    assert contacts.gap.max() < -10.0 * depth
+    assert find_turned(world, free, contacts, velocity, depth, np.inf, 0) is None
+    wide = replace(contacts, linear=contacts.gap + 20.0 * depth)  # by which the step would not have seen it
+    assert len(find_turned(world, free, wide, velocity, depth, np.inf, 0)) == 2
+
+
 def test_the_gap_at_the_start_leads_to_that_of_the_end():
     """With velocities that send grains into each other: gap + dt times normal velocity is the gap of the end."""
     world, contacts, velocity, found = found_of(MPI.COMM_SELF)
@@ -118,6 +135,8 @@ def test_a_second_linearisation_of_another_direction_or_point_stands_beside_the_
     velocity = world.grains.velocity
     free = unconstrained(world, 1.0)
     first = find_turned(world, free, find_contacts(world, 0.02, free), velocity, depth, np.inf, 0)
+    assert find_turned(world, free, first, velocity, depth, np.inf, 1) is None  # they foresee how deep these end
+    first = replace(first, linear=first.linear_gap + 100.0 * depth)  # now they do not
     for angle, stands in ((0.01, False), (0.4, True)):
         turn = quaternion.exponential(angle * np.eye(3)[:1])
         turned = replace(first, normal=quaternion.rotate(np.repeat(turn, len(first), axis=0), first.normal))

@@ -102,14 +102,14 @@ def test_a_terminal_that_goes_away_and_the_limit_of_processor_time_end_a_run_as_
     monkeypatch.setattr(interrupt, "_noted", [])
     try:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)  # these tests may run under nohup
-        interrupt.heed(MPI.COMM_SELF)
+        interrupt.catch_signals(MPI.COMM_SELF)
         for number in (signal.SIGHUP, signal.SIGXCPU):
             os.kill(os.getpid(), number)
             assert signal.getsignal(number) is signal.SIG_DFL  # once more, and it ends at once
         assert interrupt._noted == [signal.SIGHUP, signal.SIGXCPU]
-        assert interrupt.asked(MPI.COMM_SELF)
+        assert interrupt.is_requested(MPI.COMM_SELF)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
-        interrupt.heed(MPI.COMM_SELF)
+        interrupt.catch_signals(MPI.COMM_SELF)
         os.kill(os.getpid(), signal.SIGHUP)
         assert interrupt._noted == [signal.SIGHUP, signal.SIGXCPU]
     finally:

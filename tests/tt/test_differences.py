@@ -128,7 +128,7 @@ def test_the_choice_and_its_trials_cost_no_more_than_nothing_and_a_circulant(nam
     assert chosen <= 1.3 * min(alone, circulant)
     if name == "band":  # a tie: a cosine transform takes 164 iterations, none 168
         return
-    assert found.promise.spent + chosen * (2 if found.kind else 1) <= 1.3 * min(alone, 2 * circulant) + 1
+    assert found.cost_estimate.spent + chosen * (2 if found.kind else 1) <= 1.3 * min(alone, 2 * circulant) + 1
     if name == "exponential":
         assert chosen <= 0.4 * circulant
 

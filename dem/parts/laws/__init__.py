@@ -22,7 +22,7 @@ def coefficient(check: Callable[[str, Any], Any], default: Any = MISSING) -> Any
     return field(default=default, metadata={"check": check})
 
 
-class Met(NamedTuple):
+class ContactState(NamedTuple):
     """The contacts of a step, as laws see them at its start."""
 
     dt: float  #: [s]
@@ -55,6 +55,7 @@ class Law:
     touching: Any = coefficient(checks.between(0.0, 1.0), 1.0)  #: 0: the two never touch, and go through each other
 
     KEEPS: ClassVar[bool] = False  #: whether the law keeps a number of each contact
+    RESISTS: ClassVar[bool] = False  #: whether it resists the turning of bodies against each other
 
     def refuse(self) -> None:
         """ValueError for coefficients that do not go together."""
@@ -75,19 +76,19 @@ class Law:
         """The greatest attraction of bodies (n,) of such radii [N]."""
         return 0.0
 
-    def pull(self, met: Met, kept: Floats) -> Floats | None:
+    def attraction(self, met: ContactState, kept: Floats) -> Floats | None:
         """The attraction (nc,) of contacts [N]; None: nothing."""
         return None
 
-    def cone(self, met: Met, kept: Floats, friction: Floats) -> Floats:
+    def cone(self, met: ContactState, kept: Floats, friction: Floats) -> Floats:
         """The coefficients of friction (nc,), which were these before."""
         return friction
 
-    def moments(self) -> tuple[Floats, Floats] | None:
-        """Tables of the greatest moments about the tangents and about the normal, over the normal force [m]; None:
-        nothing resists them."""
+    def moments(self, met: ContactState) -> tuple[Floats, Floats] | None:
+        """The greatest moments (nc,) about the tangents and about the normal, over the normal force [m], if it RESISTS
+        them."""
         return None
 
-    def keep(self, met: Met, kept: Floats, solved: Solved) -> Floats:
+    def keep(self, met: ContactState, kept: Floats, solved: Solved) -> Floats:
         """What to keep (nc,) for the next step."""
         return np.zeros_like(kept)

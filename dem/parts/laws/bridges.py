@@ -23,7 +23,7 @@ import numpy as np
 
 from dem import checks
 from dem.arrays import Bools, Floats
-from dem.parts.laws import Law, Met, Solved, coefficient
+from dem.parts.laws import ContactState, Law, Solved, coefficient
 
 TOUCH = 1e-3  #: bodies touch at gaps below this part of that of rupture, or press with this part of the pull
 
@@ -52,7 +52,7 @@ class Bridges(Law):
         wets = np.where(self.bridge_volume > 0.0, self.surface_tension * np.cos(self.contact_angle), 0.0)
         return 2.0 * np.pi * radius * wets.max()
 
-    def pull(self, met: Met, kept: Floats) -> Floats | None:
+    def attraction(self, met: ContactState, kept: Floats) -> Floats | None:
         there = self._bridged(met, kept)
         radius, volume = np.where(there, met.radius, 0.0), np.where(there, self.bridge_volume[met.pair], 1.0)
         x = np.maximum(met.gap, 0.0) * np.sqrt(radius / volume)
@@ -60,12 +60,12 @@ class Bridges(Law):
         force: Floats = 2.0 * np.pi * radius * wets / (1.0 + 1.05 * x + 2.5 * x**2)
         return force
 
-    def keep(self, met: Met, kept: Floats, solved: Solved) -> Floats:
+    def keep(self, met: ContactState, kept: Floats, solved: Solved) -> Floats:
         pressed = TOUCH * met.dt * 2.0 * np.pi * met.radius * self.surface_tension[met.pair]
         touched = (solved.impulse[:, 0] > pressed) & (self.bridge_volume[met.pair] > 0.0)
         return np.where(self._bridged(met, kept) | touched, 1.0, 0.0)
 
-    def _bridged(self, met: Met, kept: Floats) -> Bools:
+    def _bridged(self, met: ContactState, kept: Floats) -> Bools:
         """Which contacts (nc,) have a bridge in a step: not those of two large bodies, whose radius is infinite."""
         rupture = self._rupture()[met.pair]
         wet = (rupture > 0.0) & (met.gap <= rupture) & np.isfinite(met.radius)

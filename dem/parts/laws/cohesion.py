@@ -19,7 +19,7 @@ import numpy as np
 
 from dem import checks
 from dem.arrays import Floats
-from dem.parts.laws import Law, Met, coefficient
+from dem.parts.laws import ContactState, Law, coefficient
 
 
 @dataclass(frozen=True)
@@ -42,5 +42,5 @@ class Cohesion(Law):
     def strongest(self, radius: Floats) -> Any:
         return self.cohesion.max()
 
-    def pull(self, met: Met, kept: Floats) -> Floats | None:
+    def attraction(self, met: ContactState, kept: Floats) -> Floats | None:
         return np.where(met.gap <= self.cohesion_range[met.pair], self.cohesion[met.pair], 0.0)

@@ -15,7 +15,7 @@ import numpy as np
 
 from dem import checks
 from dem.arrays import Floats
-from dem.parts.laws import Law, Met, Solved, coefficient
+from dem.parts.laws import ContactState, Law, Solved, coefficient
 
 RESTS = 0.01  #: solvers leave a slip of that order: so slides only what friction would not stop in this part of a step
 ROUNDING = 1e-12  #: a new contact is at rest below this slip [m/s]
@@ -40,11 +40,11 @@ class StaticFriction(Law):
     def acts(self) -> bool:
         return bool(np.any(self.static_friction))
 
-    def cone(self, met: Met, kept: Floats, friction: Floats) -> Floats:
+    def cone(self, met: ContactState, kept: Floats, friction: Floats) -> Floats:
         sticks = (kept > 0.0) | ((kept == 0.0) & (met.slip < ROUNDING))
         return np.where(sticks, np.maximum(friction, self.static_friction[met.pair]), friction)
 
-    def keep(self, met: Met, kept: Floats, solved: Solved) -> Floats:
+    def keep(self, met: ContactState, kept: Floats, solved: Solved) -> Floats:
         normal, *tangents = solved.impulse.T
         bears = solved.friction * normal
         left = np.maximum(bears - np.hypot(*tangents), RESTS * bears)

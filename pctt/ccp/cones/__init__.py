@@ -1,8 +1,7 @@
 """Cones of contacts: of friction, and of friction with resistance to rolling and spinning."""
 
-from pctt.ccp.cones.base import Cones, dot, tangential
+from pctt.ccp.cones.base import Cones
 from pctt.ccp.cones.friction import FrictionCones
-from pctt.ccp.cones.lorentz import TINY, Array
 from pctt.ccp.cones.rolling import RollingCones
 
-__all__ = ["TINY", "Array", "Cones", "FrictionCones", "RollingCones", "dot", "tangential"]
+__all__ = ["Cones", "FrictionCones", "RollingCones"]

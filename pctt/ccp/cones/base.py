@@ -7,7 +7,8 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.ccp.cones.lorentz import Array, LorentzForm, joined, rows, step_inside
+from pctt.arrays import Array
+from pctt.ccp.cones.lorentz import LorentzForm, joined, rows, step_inside
 
 
 class Cones(ABC):
@@ -147,21 +148,6 @@ class Cones(ABC):
     def lorentz(self) -> LorentzForm:
         """The cones as Lorentz cones."""
         return LorentzForm(self.coefficients, self.tangents)
-
-
-def tangential(x: Array) -> Array:
-    """|(g_1, g_2)| (nc,). (Five times as fast as np.hypot; no impulse is near the ends of the range of numbers.)"""
-    t = x[:, 1] * x[:, 1]
-    t += x[:, 2] * x[:, 2]
-    return np.sqrt(t, out=t)
-
-
-def dot(x: Array, y: Array) -> Array:
-    """Inner products of rows (nc,). (Six times as fast as a sum along rows of three.)"""
-    out: Array = x[:, 0] * y[:, 0]
-    out += x[:, 1] * y[:, 1]
-    out += x[:, 2] * y[:, 2]
-    return out
 
 
 def floats(values: Array) -> Array:

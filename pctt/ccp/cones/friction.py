@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dem.compiled import PART, inlined, loop, prange
-from pctt.ccp.cones.base import Array, Cones, floats, tangential
+from pctt.arrays import Array, tangential
+from pctt.ccp.cones.base import Cones, floats
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to the next

@@ -26,12 +26,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dem.compiled import inlined, loop
+from pctt.arrays import TINY, Array
 
-Array = NDArray[np.float64]
-TINY = float(np.finfo(float).tiny)
 HELD = 1e12  # stiffness of what is held, over that of normal impulses: the block keeps its digits
 LEAST = 1e-17  # determinant of a unit point that rounding has put on or outside the boundary
 ROUND = 1e-14  # tangential part of a unit scaling point below which it has no direction
@@ -60,16 +58,16 @@ class LorentzForm:
     def apply(self, g: Array) -> Array:
         """A g of impulses or other numbers of contacts (rows, 3)."""
         out = np.zeros((self.weight.size, 3))
-        _of(g, self.weight, self.positive, self.place, out)
+        _apply(g, self.weight, self.positive, self.place, out)
         return out
 
     def transpose(self, z: Array) -> Array:
         """A'z (rows, 3)."""
-        return _back(z, self.weight, self.positive, self.place, np.zeros((self.rows, 3)), False)
+        return _transpose(z, self.weight, self.positive, self.place, np.zeros((self.rows, 3)), False)
 
     def impulses(self, s: Array) -> Array:
         """The g (rows, 3) with A g = s; where the normal numbers of a contact disagree, with the greatest."""
-        return _back(s, self.weight, self.positive, self.place, np.zeros((self.rows, 3)), True)
+        return _transpose(s, self.weight, self.positive, self.place, np.zeros((self.rows, 3)), True)
 
     def right_inverse(self, y: Array) -> Array:
         """A z with A'z = y (rows, 3): all cones have the same part of the normal numbers."""
@@ -137,12 +135,12 @@ class ArrowInverse(NamedTuple):
         lorentz, parts_of = self.lorentz, self.lorentz.width // 3
         out = np.zeros((lorentz.count, lorentz.width))
         parts, weights = (self.right, self.left, self.D, self.part), (lorentz.weight.ravel(), self.sigma)
-        _alone(f, joined(r, parts_of), weights, lorentz.place, self.tangential, parts, out)
+        _uncoupled(f, joined(r, parts_of), weights, lorentz.place, self.tangential, parts, out)
         return rows(out, parts_of)
 
 
 @loop
-def _of(g, weight, live, place, out):
+def _apply(g, weight, live, place, out):
     cones, count = weight.shape
     for k in range(cones):
         for c in range(count):
@@ -155,7 +153,7 @@ def _of(g, weight, live, place, out):
 
 
 @loop
-def _back(z, weight, live, place, out, greatest):
+def _transpose(z, weight, live, place, out, greatest):
     """The normal numbers are the sum of those in z times their weights, or the ``greatest`` by them."""
     cones, count = weight.shape
     for k in range(cones):
@@ -221,7 +219,7 @@ def _arrows(root, size, u, weight, live, place, normal, tangential, X):
 
 
 @loop
-def _alone(f, r, weights, place, tangential, parts, out):
+def _uncoupled(f, r, weights, place, tangential, parts, out):
     (right, left, D, part), (weight, sigma) = parts, weights
     count, total = len(out), len(f)
     for c in range(count):

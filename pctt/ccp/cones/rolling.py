@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dem.compiled import inlined, loop
-from pctt.ccp.cones.base import Array, Cones, floats, tangential
+from pctt.arrays import Array, tangential
+from pctt.ccp.cones.base import Cones, floats
 from pctt.ccp.cones.friction import (
     NO_MOVE,
     ONE,

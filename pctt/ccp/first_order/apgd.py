@@ -23,13 +23,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
 from pctt.options import number
 
 IMPATIENT = 300  # iterations without progress in single precision: double precision takes over
+CACHED = 500  # contacts whose numbers stay in the cache, where single precision is no faster
 NEAR = 1e-4  # residual below which slow chains of force are left
 
 
@@ -55,11 +56,11 @@ class APGD(FirstOrder):
 def solve(problem: ConeProblem, guess: Array, limits: Limits, options: APGD, coulomb: bool = False) -> Result:
     """Impulses from a first guess (nc, 3): of the cone problem, or of Coulomb's law.
 
-    If the bodies are known, the first iterations have single precision, and the last ones double precision where it
-    makes a difference. The residual of the result has double precision.
+    If the bodies are known, and contacts are many, the first iterations have single precision, and the last ones double
+    precision where it makes a difference. The residual of the result has double precision.
     """
     progress = None
-    if problem.contact_map is not None:
+    if problem.contact_map is not None and problem.size > CACHED:
         rough = limits.to(max(limits.tol, options.single / np.sqrt(max(problem.size, 1))))
         impatient = replace(options, patience=min(options.patience, IMPATIENT))
         progress = Progress(ScaledProblem(problem, coulomb, np.float32), rough, impatient)

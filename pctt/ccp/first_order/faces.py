@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.cones.friction import step_to_boundary, step_to_zero
 from pctt.ccp.first_order.projected_steps import minimiser
 from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem, begin

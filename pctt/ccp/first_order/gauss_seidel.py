@@ -22,7 +22,7 @@ from mpi4py import MPI
 
 from dem.contact_map import Halo, find_halo
 from dem.exchange import offsets
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.cones.friction import project
 from pctt.ccp.delassus import DENSE, rows_in_blocks
 from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.first_order.scaled import FirstOrder, ScaledProblem, begin
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from dem.compiled import loop
 from dem.contact_map import ContactMap
-from pctt.ccp.cones import Array, Cones
+from pctt.arrays import Array
+from pctt.ccp.cones import Cones
 from pctt.ccp.delassus import GivenOperator
 from pctt.ccp.problem import ConeProblem, Errors
 from pctt.ccp.result import Limits, Result, Status

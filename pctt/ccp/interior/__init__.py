@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.ccp.cones import TINY, Array
+from pctt.arrays import TINY, Array
 from pctt.ccp.cones.lorentz import HELD
-from pctt.ccp.problem import ConeProblem
+
+if TYPE_CHECKING:
+    from pctt.ccp.problem import ConeProblem
 
 INDEFINITE = "N is not positive semidefinite: a step has negative curvature"
 

@@ -29,20 +29,23 @@ use with friction."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cones import TINY, Array, dot, lorentz, tangential
+from pctt.arrays import TINY, Array, dot, tangential
+from pctt.ccp.cones import lorentz
 from pctt.ccp.cones.friction import step_to_zero
 from pctt.ccp.cones.lorentz import ArrowInverse, NesterovTodd
 from pctt.ccp.interior import useful_part
-from pctt.ccp.newton import Newton
 from pctt.ccp.problem import ConeProblem, Errors
 from pctt.ccp.result import Limits, Result, Status
 from pctt.ccp.unbounded import why_unbounded
 from pctt.log import phase
 from pctt.options import number
+
+if TYPE_CHECKING:
+    from pctt.ccp.newton import Newton
 
 LESS, HALF = 0.9, 0.5  # of the least residual, and of the last complementarity, that count as progress
 

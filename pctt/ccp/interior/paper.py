@@ -30,15 +30,19 @@ at zero.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.cones.friction import step_to_zero
 from pctt.ccp.interior import INDEFINITE, hold, is_indefinite, velocity
-from pctt.ccp.newton import Newton
 from pctt.ccp.newton.kkt import KKT
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result, Status
+
+if TYPE_CHECKING:
+    from pctt.ccp.newton import Newton
 
 
 def solve(

@@ -22,7 +22,7 @@ from typing import NamedTuple, Optional
 
 import numpy as np
 
-from pctt.ccp.cones import Array, dot
+from pctt.arrays import Array, dot
 from pctt.ccp.cones.friction import step_to_zero, times
 from pctt.ccp.interior import INDEFINITE, hold, is_indefinite, paper, useful_part, velocity
 from pctt.ccp.newton import Newton

@@ -21,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.exchange import on_any
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.by_elimination import ByElimination, has_few, matrix_of, order_of
 from pctt.ccp.newton.by_factors import ByFactors
@@ -67,6 +67,16 @@ class Newton:
         self._systems = 0
         self._seen: tuple[Any, tuple, Order | None] = (None, (), None)  # an operator, its structure and order
         self._made: tuple[Any, GivenMatrix | None] = (None, None)  # an operator, and its matrix
+        self._of_parts: Newton | None = None
+
+    @property
+    def of_parts(self) -> Newton:
+        """Another one of the same choice, for a part of a problem that is solved beside the whole: each keeps its
+        structure from step to step. This one itself if preconditioners are compared."""
+        if self.compare is not None:
+            return self
+        self._of_parts = self._of_parts or Newton(self.comm, self.form)
+        return self._of_parts
 
     # -- the choice -------------------------------------------------------------------------------------------
 
@@ -78,7 +88,7 @@ class Newton:
         kind = "few" if few else "given" if given else self.form
         if self._linear is not None and self._kind == (kind, entries):
             return
-        self.destroy()
+        self._drop_solver()
         self._kind = kind, entries
         if few:
             self._linear = ByElimination(self.comm, self._room)
@@ -101,6 +111,10 @@ class Newton:
             self._choose(None)
         assert self._linear is not None
         return self._linear
+
+    def may_eliminate(self, problem: ConeProblem) -> bool:
+        """Whether an order of elimination is looked for at all."""
+        return self.own and has_few(problem)
 
     def has_elimination(self, problem: ConeProblem) -> bool:
         """Whether the systems of this problem are solved by elimination."""
@@ -204,7 +218,8 @@ class Newton:
     @property
     def ksp_systems(self) -> int:
         """The number of systems that a KSP was to solve so far."""
-        return self._systems + (self._linear.systems if self._linear is not None else 0)
+        parts = self._of_parts.ksp_systems if self._of_parts is not None else 0
+        return self._systems + (self._linear.systems if self._linear is not None else 0) + parts
 
     def forget(self) -> None:
         """Drop what belongs to the last problem's structure."""
@@ -217,9 +232,14 @@ class Newton:
             self._structure = None
 
     def destroy(self) -> None:
+        self._drop_solver()
+        if self._of_parts is not None:
+            self._of_parts.destroy()
+
+    def _drop_solver(self) -> None:
         self.forget()
-        self._systems = self.ksp_systems
         if self._linear is not None:
+            self._systems += self._linear.systems
             self._linear.destroy()
             self._linear = None
         if self.compare is not None:

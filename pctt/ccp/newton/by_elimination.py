@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.delassus import GivenMatrix, all_blocks
 from pctt.ccp.newton.by_ksp import ByKSP
 from pctt.ccp.newton.defaults import GIVEN
 from pctt.ccp.newton.elimination import Factors, Order, ordered
 from pctt.ccp.newton.factor import Room
-from pctt.ccp.problem import ConeProblem
+
+if TYPE_CHECKING:
+    from pctt.ccp.problem import ConeProblem
 
 FEW = 1000  # contacts up to which an order of elimination is looked for
 PAIRS = 100_000  # pairs of blocks in an elimination at most: 20 ns each

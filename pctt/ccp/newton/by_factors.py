@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.newton.defaults import DEFAULTS
 from pctt.ccp.newton.factor import Room, easy_iterations
-from pctt.ccp.newton.forms import System
 from pctt.ccp.newton.iterative import Iterative
+
+if TYPE_CHECKING:
+    from pctt.ccp.newton.forms import System
 
 LIMIT = 4.0  # iterations with block Jacobi at most, in units of the easy ones
 ALONE = 20_000  # the same where the memory has no room for a factor

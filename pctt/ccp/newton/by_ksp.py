@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.newton.defaults import INCOMPLETE, Options
 from pctt.ccp.newton.factor import Room
-from pctt.ccp.newton.forms import System
 from pctt.ccp.newton.iterative import Iterative
+
+if TYPE_CHECKING:
+    from pctt.ccp.newton.forms import System
 
 #: Iterations of BiCGStab with block Jacobi after which the next matrix of contacts gets an incomplete factor, which
 #: costs as much as 25; and with that factor, up to which the next gets none: block Jacobi takes 6 to 8 times as many.

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from scipy.linalg import lapack
 
 from dem.compiled import inlined, loop
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 
 FULL = 0.5  # part of all pairs of the rest that share a body, from which it is dense
 LEAST = 40  # contacts of a rest: fewer are eliminated by blocks as fast as by LAPACK

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from pctt import memory
-from pctt.ccp.newton.forms import System
 from pctt.ccp.newton.krylov import Krylov, Solve
 from pctt.ccp.newton.multifrontal import MultifrontalPC
 from pctt.ksp_options import OWN
+
+if TYPE_CHECKING:
+    from pctt.ccp.newton.forms import System
 
 #: Drop tolerance of a factor [mass]: entries of a block between bodies that it is better off without.
 LEAST = 0.1

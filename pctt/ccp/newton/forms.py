@@ -18,23 +18,25 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from typing import Union
+from typing import TYPE_CHECKING, Union
 
 import numpy as np
 import scipy.sparse as sp
 from petsc4py import PETSc
 
 from dem.contact_map.loops import local_product, pack
+from pctt.arrays import Array
 from pctt.blocks import put_diagonal_blocks, set_diagonal_blocks, symmetric_shell
 from pctt.body_matrix import BodyOperator, inverse_blocks
-from pctt.ccp.cones import Array
 from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.defaults import DIRECT, MULTIFRONTAL, Options
 from pctt.ccp.newton.elimination import Order
 from pctt.ccp.newton.kkt import KKT
 from pctt.ccp.newton.krylov import Source
 from pctt.ccp.newton.multifrontal import Dissection, MultifrontalFactors
-from pctt.ccp.problem import ConeProblem
+
+if TYPE_CHECKING:
+    from pctt.ccp.problem import ConeProblem
 
 
 class Form:

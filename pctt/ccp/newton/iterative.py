@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.ccp.cones import TINY, Array
+from pctt.arrays import TINY, Array
 from pctt.ccp.newton.defaults import UNSYMMETRIC, Options
 from pctt.ccp.newton.factor import Factor, Room
-from pctt.ccp.newton.forms import System
 from pctt.ccp.newton.krylov import Krylov, Solve
 from pctt.ksp_options import OWN
 from pctt.petsc import options_database
+
+if TYPE_CHECKING:
+    from pctt.ccp.newton.forms import System
 
 
 class Iterative:

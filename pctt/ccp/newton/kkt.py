@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pctt.ccp.cones import Array
+from pctt.arrays import Array
 
 
 class KKT(NamedTuple):

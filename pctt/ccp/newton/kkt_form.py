@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 from petsc4py import PETSc
 
+from pctt.arrays import Array
 from pctt.blocks import new_matrix, set_diagonal_blocks, symmetric_shell
-from pctt.ccp.cones import Array
 from pctt.ccp.delassus import rows_in_blocks
 from pctt.ccp.newton.forms import ContactForm
 from pctt.ccp.newton.kkt import KKT
-from pctt.ccp.problem import ConeProblem
+
+if TYPE_CHECKING:
+    from pctt.ccp.problem import ConeProblem
 
 
 class KKTForm(ContactForm):

@@ -10,6 +10,7 @@ import numpy as np
 
 from dem.arrays import Bools, Floats
 from dem.checks import positive
+from dem.compiled import loop
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,22 @@ class Block:
 
     def part(self, start: Floats, end: Floats) -> Floats:
         """Which part (n,) of the lines from `start` to `end` (n, 3) is inside; exact."""
-        first, last = np.zeros(len(start)), np.ones(len(start))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            for k in range(3):
-                cuts = (np.array([self.low[k], self.high[k]]) - start[:, k, None]) / (end - start)[:, k, None]
-                first, last = np.fmax(first, cuts.min(axis=1)), np.fmin(last, cuts.max(axis=1))
-        return np.maximum(last - first, 0.0)
+        return _part_of_block(*self.bounds, start, end)
+
+
+@loop
+def _part_of_block(low: Floats, high: Floats, start: Floats, end: Floats) -> Floats:
+    """`Block.part`: a line that does not change a coordinate is beyond both faces, or between them, or on one."""
+    out = np.empty(len(start))
+    for n in range(len(start)):
+        first, last = 0.0, 1.0
+        for k in range(3):
+            way = end[n, k] - start[n, k]
+            one, two = (low[k] - start[n, k]) / way, (high[k] - start[n, k]) / way
+            if not (np.isnan(one) or np.isnan(two)):
+                first, last = max(first, min(one, two)), min(last, max(one, two))
+        out[n] = max(last - first, 0.0)
+    return out
 
 
 @dataclass(frozen=True)
