@@ -88,11 +88,10 @@ def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), coordinates: Array | N
         points, whence = _other_points(fitting, P, comm)
     around = shape
     if shape is None and points is not None:
-        around, row_at = _grid_of_points(points, comm)
-        shape = around if row_at is not None else None
+        around, rows = _grid_of_points(points, comm)
         source = f"the grid of {whence}"
-        if shape is not None and row_at is not None and np.array_equal(row_at, np.arange(prod(shape))):
-            row_at = None
+        if rows is not None:
+            shape, row_at = around, None if np.array_equal(rows, np.arange(len(rows))) else rows
     return Places(shape, row_at, points, source if shape is not None else whence, around)
 
 

@@ -45,6 +45,7 @@ class EntriesTrain:
     """
 
     single_pays = True
+    _product: TrainProduct  # by the train of the inverse
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str, places: Places) -> None:
         self.comm, self.options, self.account = comm, options, account

@@ -108,8 +108,8 @@ def race(runs: Sequence[ConjugateGradients], slack: float, most: float, digits: 
 
     The cheapest so far makes the next step. With a preconditioner a run ends at half of the digits, and costs twice as
     much; without one it gains most of them late, so it goes on. The race ends when all others cost `slack` times as
-    much as the winner, or `most`. What those that have not arrived cost is extrapolated, to as many iterations as there
-    are unknowns at most. (Who lags behind at first may win, so nobody is sent home early.)
+    much as the winner, or `most`. What those that have not arrived cost is extrapolated, to no more iterations than
+    there are unknowns, if they have not made more. (Who lags behind at first may win, so nobody is sent home early.)
     """
     halves = [1.0 if run.solve is None else 0.5 for run in runs]
 
@@ -128,10 +128,11 @@ def race(runs: Sequence[ConjugateGradients], slack: float, most: float, digits: 
         elif run.norms[-1] <= run.norms[0] * 10.0 ** (-digits * halves[k]):
             running.remove(k)
             most = min(most, slack * gone(k))
-    return [
-        inf if run.failed else min(iterations(run.norms, half * digits) / half, len(run.x)) * (1 + run.each)
-        for run, half in zip(runs, halves)
-    ]
+    def cost(run: ConjugateGradients, half: float) -> float:
+        most = max(len(run.x), (len(run.norms) - 1) / half)
+        return min(iterations(run.norms, half * digits) / half, most) * (1 + run.each)
+
+    return [inf if run.failed else cost(run, half) for run, half in zip(runs, halves)]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ sign. So errors at the boundary have opposite signs, and a mean of both inverses
 only the mean of a over the signs of the coordinates. If A differs much from it (rotated anisotropy), circulants are
 better, and so is a part of the inverse of the circulant on a grid twice as wide that has A as a part.
 
-
 Each of these matrices C makes the trace of C^-1 A as large as that of I. So the bound of Kaporin (Numer. Linear Algebra
 Appl. 1, 1994), by which conjugate gradients take fewer iterations the smaller trace^N / det is, depends on det C alone:
 of the transforms, the one with the smallest determinant is the best. Whether another preconditioner or none is better
@@ -41,6 +40,7 @@ PART = 0.25  # of the cost of a solution, that trials may cost
 SLACK = 1.3  # a preconditioner that costs so many times more than another one on a part is not tried further there
 OUT = 2.0  # one that costs so many times more on all parts so far is not tried on others
 DEAR = 1000.0  # products that a trial may cost
+BINS = 4000  # numbers that stand for the eigenvalues of a matrix
 UNTRIED = [1.0, 0.5]  # norms that stand for those of a trial
 
 #: What is tried: the transforms of which the mean of the inverses is taken, and their shares.
@@ -300,15 +300,35 @@ def eigenvalues(a: Differences, transform: str) -> tuple[Array, float | None]:
     return (values.real if a.block == 1 else values), bound
 
 
-def log_determinant(a: Differences, transform: str) -> float:
-    """Of the nearest matrix to A that a "cosine", a "sine" or a "circulant" diagonalises, per unknown."""
+def spectrum(a: Differences, transform: str) -> tuple[Array, Array]:
+    """The eigenvalues of the nearest matrix to A that a "cosine", a "sine" or a "circulant" diagonalises, and how often
+    they occur."""
     values, _ = eigenvalues(a, transform)
     values = values[..., 0] if a.block == 1 else np.linalg.eigvalsh(values)
-    logs = np.log(np.maximum(values, FLOOR * abs(values).max() or 1.0)).reshape(*values.shape[: len(a.shape)], -1)
-    if transform == "circulant":  # a half of the spectrum
-        n = a.shape[-1]
-        logs = logs * np.where(np.arange(n // 2 + 1) % (n / 2) > 0, 2.0, 1.0)[:, None]
-    return float(logs.sum() / (prod(a.shape) * a.block))
+    n, often = a.shape[-1], np.ones(values.shape)
+    if transform == "circulant":  # a half of them
+        often[..., (np.arange(n // 2 + 1) % (n / 2) > 0), :] = 2.0
+    return np.maximum(values, FLOOR * abs(values).max() or 1.0).ravel(), often.ravel()
+
+
+def log_determinant(a: Differences, transform: str) -> float:
+    """Of the nearest matrix to A that a "cosine", a "sine" or a "circulant" diagonalises, per unknown."""
+    values, often = spectrum(a, transform)
+    return float(often @ np.log(values) / often.sum())
+
+
+def foreseen(a: Differences) -> float:
+    """Iterations of conjugate gradients without a preconditioner, for the eigenvalues of the most promising transform.
+
+    A itself may take fewer, if the transform smears its spectrum.
+    """
+    values, often = spectrum(a, promising(a)[0][0])
+    logs = np.log(values)
+    width = (logs.max() - logs.min()) / BINS or 1.0
+    bins = ((logs - logs.min()) / width).astype(int)
+    count, total = np.bincount(bins, often), np.bincount(bins, often * values)
+    found, count = total[count > 0] / count[count > 0], count[count > 0]
+    return race([ConjugateGradients(lambda x: found * x, count**0.5)], 1.0, DEAR)[0]
 
 
 def _along_last(a: Array, kind: str) -> Array:
@@ -375,13 +395,18 @@ def parts(a: Differences) -> list[Differences]:
     return [a.part(sides), a.means_of([n // width for n, width in zip(shape, widths)], widths)]
 
 
+def promising(a: Differences) -> Kind:
+    """The transform with the smallest determinant."""
+    return min((COSINE, CIRCULANT, SINE), key=lambda kind: log_determinant(a, kind[0][0]))
+
+
 def candidates(a: Differences) -> list[Kind]:
     """What may be the best preconditioner, none among them: the most promising transform first.
 
     The determinant weighs small eigenvalues, Frobenius' norm large ones, so the best by either is among them. A cosine
     and a sine transform see only the means of a over the signs of coordinates. If a is not even, circulants are too.
     """
-    best = min((COSINE, CIRCULANT, SINE), key=lambda kind: log_determinant(a, kind[0][0]))
+    best = promising(a)
     nearest = min((COSINE, CIRCULANT, SINE), key=lambda kind: a.distance(kind[0][0]))
     means, signs = MEANS if best != CIRCULANT else (), () if a.even else (CIRCULANT, EMBEDDING)
     return list(dict.fromkeys([best, NOTHING, *signs, nearest, *means, *[BLOCK_DIAGONAL] * (a.block > 1)]))
@@ -391,21 +416,23 @@ def choose(a: Differences) -> Choice | None:
     """The preconditioner with which conjugate gradients cost least; None if A is not positive definite.
 
     It is found on small parts of the grid: on lines, on lines that are twice as wide, and on parts with all axes. What
-    costs OUT times as much as another is not tried further. Beside none as many are tried as cost PART of a solution,
-    which costs as much as on the hardest part at least; on the last parts two are. The smallest sum over all parts
-    wins, so the harder parts count more. If a grid is too small for trials, the most promising one is taken.
+    costs OUT times as much as another is not tried further. Beside none and circulants as many are tried as cost PART
+    of a solution, which costs as much as on the hardest part at least; on the last parts two are. The smallest sum over
+    all parts wins, so the harder parts count more; that of none grows as is foreseen. If a grid is too small for
+    trials, the most promising one is taken.
     """
     if max(a.aperiodic) <= 1e-12:  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
         return Choice(CIRCULANT, CostEstimate(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
-    kinds, size, trials = candidates(a), prod(a.shape), list[_Trial]()
+    kinds, size, trials, scores = candidates(a), prod(a.shape), list[_Trial](), dict[Kind, float]()
     for pieces, least in ((lines(a, 1), 0), (lines(a, 2), 0), (parts(a), 2)):
+        kinds = [kind for kind in kinds if not scores or scores[kind] <= OUT * scores[kinds[0]]]
         solution = max((trial.costs[kinds[0]] for trial in trials), default=inf)
         share = sum(prod(part.shape) for part in pieces) / size
         most = max(least, int((PART - _spent(trials, size) / solution) / share))
         if share > PART or min(most, len(kinds)) < 2:
             continue
-        kinds = kinds[:most] + [NOTHING] * (NOTHING in kinds[most:])
+        kinds = kinds[:most] + [kind for kind in kinds[most:] if kind in (NOTHING, CIRCULANT)]
         for part in pieces:
             trial = _Trial.run_with(part, kinds)
             if trial is None:
@@ -413,7 +440,9 @@ def choose(a: Differences) -> Choice | None:
             trials.append(trial)
         scores = {kind: sum(trial.costs[kind] for trial in trials) for kind in kinds}
         kinds = sorted(kinds, key=lambda kind: scores[kind])
-        kinds = [kind for kind in kinds if scores[kind] <= OUT * scores[kinds[0]]]
+    if trials and kinds[0] == NOTHING:  # parts need not show how many eigenvalues are large
+        scores[NOTHING] *= max(1.0, foreseen(a) / sum(foreseen(trial.a) for trial in trials))
+        kinds = sorted(kinds, key=lambda kind: scores[kind])
     found = kinds[0]
     if not trials:
         inverse = FastInverse(a, found)
@@ -436,7 +465,7 @@ class _Trial:
     """
 
     def __init__(self, a: Differences, inverses: dict[Kind, FastInverse]) -> None:
-        times, self.shape, points = a.times, a.shape, prod(a.shape)
+        times, self.a, points = a.times, a, prod(a.shape)
         b = np.random.default_rng(0).standard_normal(points * a.block)
         solves = {kind: inverse.solve if kind else None for kind, inverse in inverses.items()}
         self.runs = {kind: ConjugateGradients(times, b, solves[kind], inverses[kind].each) for kind in inverses}
@@ -453,7 +482,7 @@ class _Trial:
 
     @property
     def spent(self) -> float:
-        return prod(self.shape) * sum(run.cost for run in self.runs.values())
+        return prod(self.a.shape) * sum(run.cost for run in self.runs.values())
 
 
 # -- the differences of entries ------------------------------------------------------------------------------

@@ -333,7 +333,7 @@ Iterations are the KSP's own.
 
 {said}
 
-`run/study drawn_kernels` draws others at random, with which nothing was tuned.
+`run/study drawn_kernels 1100 1160` draws others at random, with which nothing was tuned.
 
 """
 WORDS = {

@@ -215,6 +215,14 @@ def test_distances_are_those_of_the_nearest_matrices() -> None:
     assert a.distance("circulant") == pytest.approx(apart / np.linalg.norm(A))
 
 
+def test_eigenvalues_foresee_what_none_takes() -> None:
+    for a in (kernel(KERNELS["exponential"], 0.02), kernel(KERNELS["periodic"], 0.02)):
+        assert of.foreseen(a) == pytest.approx(count(a, of.NOTHING), rel=0.15)
+    a = kernel(np.exp(-((offsets(1200)[0] / 12) ** 2)), 1e-3)
+    assert max(count(part, of.NOTHING) for part in of.parts(a)) <= 30  # few eigenvalues of a part are large
+    assert count(a, of.choose(a).kind) <= 0.2 * count(a, of.NOTHING)
+
+
 def test_determinants_are_those_of_the_nearest_matrices() -> None:
     for shape, block in (((4, 5), 2), ((5, 4), 1), ((3, 1), 2)):
         a = some(shape, block, False, 5)
