@@ -124,7 +124,7 @@ class Cell(Named):
 
     def whole(self, way: Floats) -> Floats:
         """The part (..., 3) of ways (..., 3) that is whole periods [m]; without it, ways lead to the nearest image."""
-        return self._lengths * np.round(way / self.period)
+        return self._lengths * np.round(way / self.period) if self.periodic else np.zeros(way.shape)
 
     def images(self) -> tuple[Floats, Floats]:
         """By how many periods (k, 3) a body and its images about the cell are moved, and how many sheared boundaries
