@@ -142,8 +142,7 @@ def _margins(
     dt, velocity = (0.0, world.grains.velocity) if free is None else (free.dt, free.grains)
     if shifts is None:
         shifts = (np.zeros(world.large.velocity.shape) if free is None else dt * free.drives.free)[None]
-    way = ways(world.grains.shape, world.grains.size, arms(world.forms), velocity, FURTHER * dt)
-    way = way + world.cell.margin(dt, world.grains)
+    way = ways_of_grains(world, velocity, dt, FURTHER)
     return np.maximum(np.maximum(delta / 2, way), least), way, shifts
 
 
@@ -309,6 +308,17 @@ def goes_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool
         return length(shift[..., free, :3]) + size * length(shift[..., free, 3:])
 
     return bool(((way(shift) > delta / 2) & (way(shift - seen) > 0.01 * delta).all(axis=0)).any())
+
+
+def ways_of_grains(world: World, velocity: Floats, dt: float, further: float = 1.0) -> Floats:
+    """`ways` (grains,) of the local grains with these velocities (grains, 6), so many times; in a sheared cell those
+    beside the flow, as far as there are no obstacles in it, with what this brings pairs together [m]."""
+    grains, cell = world.grains, world.cell
+    table = grains.shape, grains.size, arms(world.forms)
+    way = ways(*table, cell.beside_flow(grains.position, velocity), further * dt) + cell.margin(dt, grains)
+    if cell.gradient is not None and world.obstacles:
+        way = np.maximum(way, ways(*table, velocity, further * dt))
+    return way
 
 
 @loop

@@ -14,7 +14,7 @@ import numpy as np
 from dem import bodies, quaternion
 from dem.arrays import ArrayLike, Bools, Floats, Ints, Keys, places
 from dem.bodies import CLUMP, POLYHEDRON, SPHERE, Bodies
-from dem.contact import Contacts, contact_order, find_contacts, goes_beyond, velocities_about, ways
+from dem.contact import Contacts, contact_order, find_contacts, goes_beyond, velocities_about, ways_of_grains
 from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
 from dem.measures import Sample
@@ -192,8 +192,7 @@ def find_overrun(
     The search may be repeated for the contacts that it finds: margins only grow.
     """
     dt, seen = free.dt, contacts.near.margin[: contacts.near.grains]
-    way = ways(world.grains.shape, world.grains.size, arms(world.forms), velocity[: len(seen)], dt)
-    way = way + world.cell.margin(dt, world.grains)
+    way = ways_of_grains(world, velocity[: len(seen)], dt)
     large = large_velocity(world, free, velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
     gone = bool((way > seen).any()), goes_beyond(world, dt * large, contacts.shifts, delta)
