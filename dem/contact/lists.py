@@ -56,7 +56,7 @@ class Lists:
 
     def hold(self, world: World, margin: Floats) -> bool:
         """Whether the lists of this rank have all pairs of these margins (grains,)."""
-        if not all(map(is_, self.constant, _constant(world))) or world.cell.moves and world.obstacles:
+        if not all(map(is_, self.constant, _constant(world))):
             return False
         then, size, strain = self.near.bodies.position, self.table.radius, world.cell.strained_since(self.cell)
         nearer = 1.0 - float(np.linalg.svd(strain, compute_uv=False)[-1])

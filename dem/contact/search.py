@@ -311,14 +311,11 @@ def goes_beyond(world: World, shift: Floats, seen: Floats, delta: float) -> bool
 
 
 def ways_of_grains(world: World, velocity: Floats, dt: float, further: float = 1.0) -> Floats:
-    """`ways` (grains,) of the local grains with these velocities (grains, 6), so many times; in a sheared cell those
-    beside the flow, as far as there are no obstacles in it, with what this brings pairs together [m]."""
+    """`ways` (grains,) of the local grains with these velocities (grains, 6), so many times; in a sheared cell, which
+    has no large bodies, those beside the flow, with what this brings pairs together [m]."""
     grains, cell = world.grains, world.cell
-    table = grains.shape, grains.size, arms(world.forms)
-    way = ways(*table, cell.beside_flow(grains.position, velocity), further * dt) + cell.margin(dt, grains)
-    if cell.gradient is not None and world.obstacles:
-        way = np.maximum(way, ways(*table, velocity, further * dt))
-    return way
+    beside = cell.beside_flow(grains.position, velocity)
+    return ways(grains.shape, grains.size, arms(world.forms), beside, further * dt) + cell.margin(dt, grains)
 
 
 @loop

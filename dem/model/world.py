@@ -17,7 +17,6 @@ from dem.parts.cell import OPEN, Cell
 from dem.parts.contact_law import ContactLaw
 from dem.parts.sources import Passages
 from dem.scene import LargeBody, no_parts
-from dem.shapes import Plane
 from dem.shapes.forms import Form
 from dem.together import together
 
@@ -95,11 +94,6 @@ class World:
         self.comm.Allgather(np.array([len(grains), (grains.shape != bodies.SPHERE).any()], np.int64), everyone[1:])
         self.slabs = np.cumsum(everyone[:, 0])
         self.only_spheres = not everyone[:, 1].any()
-
-    @property
-    def obstacles(self) -> bool:
-        """Whether there are large bodies other than half spaces."""
-        return not all(isinstance(shape, Plane) for body in self.large_bodies for shape in body.shapes)
 
     @property
     def ids(self) -> int:
