@@ -58,9 +58,9 @@ class Lists:
         """Whether the lists of this rank have all pairs of these margins (grains,)."""
         if not all(map(is_, self.constant, _constant(world))):
             return False
-        then, size, strain = self.near.bodies.position, self.table.radius, world.cell.strained_since(self.cell)
-        nearer = 1.0 - float(np.linalg.svd(strain, compute_uv=False)[-1])
-        return stays(then, self.near.margin, size, world.grains.position, margin, strain, nearer)
+        then, size = self.near.bodies.position, self.table.radius
+        strained = world.cell.strained_since(self.cell)
+        return stays(then, self.near.margin, size, world.grains.position, margin, *strained)
 
 
 def grain_lists(world: World, last: Lists | None, margin: Floats, way: Floats) -> Lists:

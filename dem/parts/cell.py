@@ -195,13 +195,16 @@ class Cell(Named):
             return 0.0
         return strain * 3.0 * bodies.bounding_radius(grains)  # with a margin of two radii, the greatest there is
 
-    def strained_since(self, then: Cell) -> Floats:
-        """The deformation (3, 3) that brings the images of `then` to where they are now."""
+    def strained_since(self, then: Cell) -> tuple[Floats, float]:
+        """The deformation (3, 3) that brings the images of `then` to where they are now, and by which part of their
+        distance it brings points nearer to each other at most."""
         out = np.eye(3)
-        out[self.axes, self.axes] = (self.period / then.period)[self.axes]
+        if not self.moves:
+            return out, 0.0
+        out[self.axes, self.axes] = self.period[self.axes] / then.period[self.axes]
         if self.gradient is not None:
             out[0, self.gradient] = (self.shift - out[0, 0] * then.shift) / then.period[self.gradient]
-        return out
+        return out, 1.0 - float(np.linalg.svd(out, compute_uv=False)[-1])
 
     def given_at(self, time: float, dt: float) -> Floats:
         """Rates (3,) at which the periods are to grow in the step of dt [s] from the `time` [s]; NaN: what the asked
