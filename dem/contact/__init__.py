@@ -2,4 +2,4 @@
 
 from dem.contact.search import Contacts, contact_order, exceeds_margin, find_contacts, greatest_travel, velocities_about
 
-__all__ = ["Contacts", "contact_order", "find_contacts", "exceeds_margin", "greatest_travel", "velocities_about"]
+__all__ = ["Contacts", "contact_order", "find_contacts", "exceeds_margin", "velocities_about", "greatest_travel"]

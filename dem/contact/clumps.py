@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dem import quaternion
 from dem.arrays import Floats, Ints
 from dem.bodies import CLUMP, PLANE, POLYHEDRON, Bodies
 from dem.compiled import inlined, loop
@@ -26,7 +25,22 @@ class Members(NamedTuple):
 
     def now(self, position: Floats, turn: Floats) -> Floats:
         """Centres (m, 3) of the spheres of bodies with these positions (rows, 3) and quaternions (rows, 4)."""
-        return position[self.row] + quaternion.rotate(turn[self.row], self.center)
+        return _placed(self.row, self.center, position, turn)
+
+
+@loop
+def _placed(row, center, position, turn):
+    """Points `center` (m, 3) of bodies in the rows (m,) in the world."""
+    out = np.empty((len(row), 3))
+    for n in range(len(row)):
+        i = row[n]
+        w, a, b, c = turn[i, 0], turn[i, 1], turn[i, 2], turn[i, 3]
+        x, y, z = center[n, 0], center[n, 1], center[n, 2]
+        u, v, t = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+        out[n, 0] = position[i, 0] + (x + w * u + b * t - c * v)
+        out[n, 1] = position[i, 1] + (y + w * v + c * u - a * t)
+        out[n, 2] = position[i, 2] + (z + w * t + a * v - b * u)
+    return out
 
 
 def spheres(forms: Sequence[Form]) -> tuple[list[Floats], list[Floats]]:

@@ -50,7 +50,6 @@ class Lists:
     near: Neighbourhood  #: then; its margins have the slack
     halo: Halo  #: between the grains of `near`
     table: Primitives  #: of the bodies of `near`, not yet where they are
-    margin: Floats  #: (grains,) without slack [m]
     own: Rows  #: pairs of local grains
     away: Rows  #: pairs of a local grain and a ghost or an image
     images: Images  #: of grains and ghosts
@@ -59,9 +58,11 @@ class Lists:
 
     def hold(self, world: World, margin: Floats) -> bool:
         """Whether the lists of this rank have all pairs of these margins (grains,)."""
-        margin = margin + world.cell.image_travel(self.cell)
-        same = all(map(is_, self.constant, _constant(world)))
-        return same and stays(self.near.bodies.position, self.near.margin, self.margin, world.grains.position, margin)
+        if not all(map(is_, self.constant, _constant(world))):
+            return False
+        then, size = self.near.bodies.position, self.table.radius
+        strained = world.cell.strained_since(self.cell)
+        return stays(then, self.near.margin, size, world.grains.position, margin, *strained)
 
 
 def grain_lists(world: World, last: Lists | None, margin: Floats, travel: Floats) -> Lists:
@@ -85,7 +86,7 @@ def _new_lists(world: World, margin: Floats, travel: Floats) -> Lists:
     owner = np.searchsorted(world.slabs, index, side="right") - 1
     halo = Halo(world.comm, grains, len(near.bodies), np.arange(grains, count), owner, index - world.slabs[owner])
     own, away = (Rows(*in_rows(pairs, table.number, grains, *ends)) for ends in ((0, grains), (grains, seen)))
-    return Lists(near, halo, table, margin, own, away, pictures, world.cell, _constant(world))
+    return Lists(near, halo, table, own, away, pictures, world.cell, _constant(world))
 
 
 def _constant(world: World) -> list[Any]:
@@ -96,13 +97,20 @@ _COLUMNS = attrgetter("id", "mass", "inertia", "material", "shape", "size")
 
 
 @loop
-def stays(then: Floats, most: Floats, margin: Floats, now: Floats, wanted: Floats) -> bool:
-    """Whether no grain of margin (n,) has moved from the place `then` (n or more, 3) to the place `now` (n, 3) and
-    wants another margin (n,), by more than leads to the margin `most` (n or more,)."""
+def stays(then: Floats, most: Floats, size: Floats, now: Floats, wanted: Floats, strain: Floats, nearer: float) -> bool:
+    """Whether no grain has gone from the place `then` (n or more, 3) to the place `now` (n, 3), and wants a margin
+    (n,), by more than leads to the margin `most` (n or more,) that it had then.
+
+    What counts of its way is that beside the deformation `strain` (3, 3) of the cell, which brings pairs, of radii
+    `size` (n or more,), `nearer` by this part of their distance at most."""
     for n in range(len(now)):
-        x, y, z = now[n, 0] - then[n, 0], now[n, 1] - then[n, 1], now[n, 2] - then[n, 2]
-        gone = np.sqrt(x * x + y * y + z * z) + wanted[n] - margin[n]
-        if not gone <= (1.0 - 1e-9) * (most[n] - margin[n]):  # also for NaN
+        x, y, z = now[n, 0], now[n, 1], now[n, 2]
+        for k in range(3):
+            x -= strain[0, k] * then[n, k]
+            y -= strain[1, k] * then[n, k]
+            z -= strain[2, k] * then[n, k]
+        gone = np.sqrt(x * x + y * y + z * z) + wanted[n] + nearer * (size[n] + most[n])
+        if not gone <= (1.0 - 1e-9) * most[n]:  # also for NaN
             return False
     return True
 

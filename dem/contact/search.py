@@ -9,7 +9,7 @@ import numpy as np
 
 from dem import bodies
 from dem.arrays import Bools, Floats, Ints, Keys, places
-from dem.bodies import CAPSULE, FORM, MESH, SPHERE
+from dem.bodies import CAPSULE, CLUMP, FORM, MESH, POLYHEDRON, SPHERE
 from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.ahead import Course
@@ -21,6 +21,7 @@ from dem.model.neighbourhood import Neighbourhood, refreshed
 from dem.model.world import World
 from dem.parts.cell import Cell
 from dem.quaternion import cross, length
+from dem.shapes.clumps import arms
 from dem.unconstrained.drives import free_directions, free_turns
 
 if TYPE_CHECKING:
@@ -143,8 +144,7 @@ def _margins(
     dt, velocity = (0.0, world.grains.velocity) if free is None else (free.dt, free.grains)
     if shifts is None:
         shifts = (np.zeros(world.large.velocity.shape) if free is None else dt * free.drives.free)[None]
-    travel = greatest_travel(world.grains.shape, world.grains.size, velocity, FURTHER * dt)
-    travel = travel + world.cell.margin(dt, world.grains)
+    travel = greatest_travel(world, velocity, dt, FURTHER)
     return np.maximum(np.maximum(delta / 2, travel), least), travel, shifts
 
 
@@ -268,8 +268,34 @@ def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Keys
     foreign[near.grains : near.grains + near.ghosts] = True
     if world.comm.rank < world.comm.size - 1:
         foreign[near.grains + near.ghosts :] = bodies.is_dynamic(world.large)
-    owner = np.minimum(a, b)  # the local grains are the first rows, and ghosts come from higher ranks only
-    return np.lexsort((key, owner, foreign[a] | foreign[b]))
+    return _order(foreign, a, b, key)
+
+
+@loop
+def _order(foreign, a, b, key):
+    """The contacts by whether one of their rows is foreign, by the lower row, and by key. They are counted into places
+    by the first two; of those with the same, which are few and nearly in order, each goes before the greater ones."""
+    rows = len(foreign)
+    place, start = np.empty(len(a), np.int64), np.zeros(2 * rows + 1, np.int64)
+    for c in range(len(a)):
+        place[c] = min(a[c], b[c])  # the local grains are the first rows, and ghosts come from higher ranks only
+        if foreign[a[c]] or foreign[b[c]]:
+            place[c] += rows
+        start[place[c] + 1] += 1
+    for n in range(2 * rows):
+        start[n + 1] += start[n]
+    order, end = np.empty(len(a), np.int64), start[:-1].copy()
+    for c in range(len(a)):
+        first, to, one, two = start[place[c]], end[place[c]], key[c].real, key[c].imag
+        end[place[c]] += 1
+        while to > first:
+            other = key[order[to - 1]]
+            if other.real < one or (other.real == one and other.imag <= two):
+                break
+            order[to] = order[to - 1]
+            to -= 1
+        order[to] = c
+    return order
 
 
 def exceeds_margin(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
@@ -286,21 +312,31 @@ def exceeds_margin(world: World, shift: Floats, seen: Floats, delta: float) -> b
     return bool(((distance(shift) > delta / 2) & (distance(shift - seen) > 0.01 * delta).all(axis=0)).any())
 
 
+def greatest_travel(world: World, velocity: Floats, dt: float, further: float = 1.0) -> Floats:
+    """Return about how far (grains,) a point of each local grain with these velocities (grains, 6) goes in dt, so many
+    times; in a sheared cell, which has no large bodies, beside the flow, with what this brings pairs together [m]."""
+    grains, cell = world.grains, world.cell
+    beside = cell.beside_flow(grains.position, velocity)
+    return _travel(grains.shape, grains.size, arms(world.forms), beside, further * dt) + cell.margin(dt, grains)
+
+
 @loop
-def greatest_travel(shape: Ints, size: Floats, velocity: Floats, dt: float) -> Floats:
-    """About how far (n,) a point of each grain goes in dt [s], at most two of its radii [m]. For spheres it is the
-    centre's way, as turning does not move their surface. NaN where the velocity is not finite."""
+def _travel(shape: Ints, size: Floats, arms: Floats, velocity: Floats, dt: float) -> Floats:
+    """At most two of the radii of each grain [m]. Turning moves the centres of spheres, not their surfaces: no single
+    ones, those of clumps by their `arms` (forms,) [m], those of capsules by the half length. NaN where the velocity is
+    not finite."""
     out = np.empty(len(shape))
     for n in range(len(shape)):
         v = velocity[n]
         speed, spin = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2), np.sqrt(v[3] ** 2 + v[4] ** 2 + v[5] ** 2)
         radius = np.sqrt(size[n, 0] ** 2 + size[n, 1] ** 2 + size[n, 2] ** 2)
+        arm = 0.0 if shape[n] == SPHERE else radius
         if shape[n] == CAPSULE:
-            radius = size[n, 0] + size[n, 1]
+            radius, arm = size[n, 0] + size[n, 1], size[n, 1]
         elif shape[n] >= FORM:
             radius = size[n, 0]
-        if shape[n] != SPHERE:
-            speed += radius * spin
+            arm = arms[shape[n] - CLUMP] if CLUMP <= shape[n] < POLYHEDRON else radius
+        speed += arm * spin
         out[n] = min(dt * speed, 2.0 * radius) if np.isfinite(speed + spin) else np.nan
     return out
 

@@ -124,7 +124,7 @@ class Cell(Named):
 
     def whole(self, vector: Floats) -> Floats:
         """The part (..., 3) of ways (..., 3) that is whole periods [m]; without it, ways lead to the nearest image."""
-        return self._lengths * np.round(vector / self.period)
+        return self._lengths * np.round(vector / self.period) if self.periodic else np.zeros(vector.shape)
 
     def images(self) -> tuple[Floats, Floats]:
         """By how many periods (k, 3) a body and its images about the cell are moved, and how many sheared boundaries
@@ -181,29 +181,30 @@ class Cell(Named):
         return replace(then, shift=(self.shift - dt * then.speed) / float(stretch[0]))
 
     def beside_flow(self, position: Floats, velocity: Floats) -> Floats:
-        """Linear velocities (n, 3) beside those of the shear at these positions (n, 3) [m/s]."""
+        """Velocities (n, 3 or 6) beside those of the shear at these positions (n, 3)."""
         beside = velocity.copy()
         if self.gradient is not None:
             beside[:, 0] -= self.shear_rate * position[:, self.gradient]
         return beside
 
     def margin(self, dt: float, grains: Bodies) -> Floats | float:
-        """What the margins (n,) of grains have beside their ways in dt [s]: half the way of images
-        behind a sheared boundary, as both grains of a pair have a half, and the share of a grain in the way by which
-        the cell brings the centres of a pair together as it changes its size [m]."""
-        sheared = 0.5 * dt * abs(self.speed)
-        if not self.rate.any():
-            return sheared
-        reach = 3.0 * bodies.bounding_radius(grains)  # with a margin of two radii, the greatest of `dem.contact`
-        return sheared + dt * np.abs(self.rate).max() * reach
-
-    def image_travel(self, then: Cell) -> float:
-        """What two grains of a pair have each of the way by which images have moved since `then` [m]."""
-        if not self.moves:
+        """What the margins (n,) of grains have beside their ways in dt [s]: the share of a grain in the way by which
+        the shear, and the cell as it changes its size, bring the centres of a pair together [m]."""
+        strain = dt * (abs(self.shear_rate) + float(np.abs(self.rate).max()))
+        if not strain:
             return 0.0
-        growth = np.abs(np.subtract(self.period, then.period, out=np.zeros(3), where=self.axes))
-        most = 2.0 + abs(then.shift) / then.period[0]  # periods along x in the ways of images of a sheared cell
-        return 0.5 * (abs(self.shift - then.shift) + float(growth @ (most, 1.0, 1.0)))
+        return strain * 3.0 * bodies.bounding_radius(grains)  # with a margin of two radii, the greatest there is
+
+    def strained_since(self, then: Cell) -> tuple[Floats, float]:
+        """The deformation (3, 3) that brings the images of `then` to where they are now, and by which part of their
+        distance it brings points nearer to each other at most."""
+        out = np.eye(3)
+        if not self.moves:
+            return out, 0.0
+        out[self.axes, self.axes] = self.period[self.axes] / then.period[self.axes]
+        if self.gradient is not None:
+            out[0, self.gradient] = (self.shift - out[0, 0] * then.shift) / then.period[self.gradient]
+        return out, 1.0 - float(np.linalg.svd(out, compute_uv=False)[-1])
 
     def given_rates(self, time: float, dt: float) -> Floats:
         """Rates (3,) at which the periods are to grow in the step of dt [s] from the `time` [s]; NaN: what the asked

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from dem import quaternion
-from dem.arrays import Floats
+from dem.arrays import Floats, frozen
 from dem.bodies import CLUMP
 from dem.compiled import loop
 from dem.shapes.forms import Form
@@ -46,9 +46,11 @@ class ClumpForm(Form):
         return {"centres": self.center.tolist(), "radii": self.radius.tolist()}
 
 
-def arm(form: Form) -> float:
-    """How far the centre of a sphere of a clump is from that of the clump, at most; 0 of other forms [m]."""
-    return float(np.linalg.norm(form.center, axis=1).max()) if isinstance(form, ClumpForm) else 0.0
+@cache
+def arms(forms: tuple[Form, ...]) -> Floats:
+    """How far (forms,) the centre of a sphere of a clump is from that of the clump, at most; 0 of other forms [m]."""
+    each = [np.linalg.norm(form.center, axis=1).max() if isinstance(form, ClumpForm) else 0.0 for form in forms]
+    return frozen(np.array(each, float))
 
 
 @cache

@@ -19,7 +19,7 @@ from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
 from dem.measures import Sample
 from dem.model.world import World
-from dem.shapes.clumps import arm
+from dem.shapes.clumps import arms
 from dem.step.laws import along_normal
 from dem.step.system import ContactSystem, contact_arms, contact_frames, gap_velocities
 from dem.together import barrier
@@ -192,8 +192,7 @@ def find_overrun(
     The search may be repeated for the contacts that it finds: margins only grow.
     """
     dt, seen = free.dt, contacts.near.margin[: contacts.near.grains]
-    travel = greatest_travel(world.grains.shape, world.grains.size, velocity[: len(seen)], dt)
-    travel = travel + world.cell.margin(dt, world.grains)
+    travel = greatest_travel(world, velocity[: len(seen)], dt)
     large = large_velocity(world, free, velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
     gone = bool((travel > seen).any()), exceeds_margin(world, dt * large, contacts.shifts, delta)
@@ -295,8 +294,7 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
     grains, angle = world.grains, dt * quaternion.length(velocity[:, 3:])
     way, clump = bodies.bounding_radius(grains) * angle, (grains.shape >= CLUMP) & (grains.shape < POLYHEDRON)
     if clump.any():
-        arms = np.array([arm(form) for form in world.forms])
-        way[clump] = arms[grains.shape[clump] - CLUMP] * angle[clump] ** 2
+        way[clump] = arms(world.forms)[grains.shape[clump] - CLUMP] * angle[clump] ** 2
     fast, finite = bool((way[grains.shape != SPHERE] > depth).any()), bool(np.isfinite(velocity).all())
     fast, not_finite = on_any(world.comm, fast, not finite)
     return fast and not not_finite

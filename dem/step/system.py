@@ -29,7 +29,7 @@ from dem.compiled import loop
 from dem.contact_map import CompactRows, ContactMap, Halo
 from dem.contact_map.loops import closing, scale
 from dem.contact_map.mass import CellMass, ConstrainedMass
-from dem.contact_map.rows import packed
+from dem.contact_map.rows import UPPER
 from dem.free_motion import kept_spin
 from dem.model.world import World
 from dem.parts.laws import Solved
@@ -390,11 +390,11 @@ def inverse_root_masses(world: World, drives: Drives) -> Floats:
     if world.only_spheres and not bodies.is_dynamic(world.large).any():
         parts = [_inverse_roots(table.mass, table.inertia) for table in tables]
         return np.concatenate(parts) if last else parts[0]
-    owned = bodies.concatenate(tables)
-    translation = np.eye(3) / np.sqrt(owned.mass)[:, None, None]
-    guides = free_directions(world.large_bodies) if last else np.zeros((0, 3, 3))
-    translation[len(world.grains) :] = translation[len(world.grains) :] @ guides
-    return packed(np.stack([translation, bodies.inverse_root_inertia(owned)], axis=1))
+    out = np.concatenate([_inverse_roots_turned(table.mass, table.inertia, table.quaternion) for table in tables])
+    if last:
+        guided = free_directions(world.large_bodies) / np.sqrt(tables[1].mass)[:, None, None]
+        out[len(world.grains) :, :6] = guided.reshape(-1, 9)[:, UPPER]
+    return out
 
 
 @loop
@@ -407,6 +407,25 @@ def _inverse_roots(mass: Floats, inertia: Floats) -> Floats:
         for k in range(3):
             same = n > 0 and inertia[n, k] == inertia[last, k]
             out[n, 3 + k] = out[last, 3 + k] if same else 1.0 / np.sqrt(inertia[n, k])
+    return out
+
+
+@loop
+def _inverse_roots_turned(mass: Floats, inertia: Floats, quaternion: Floats) -> Floats:
+    """M^-1/2 of bodies of masses (n,) and principal moments (n, 3), turned by quaternions (n, 4), as rows (n, 12)."""
+    out, way = np.zeros((len(mass), 12)), np.empty((3, 3))
+    for n in range(len(mass)):
+        out[n, 0] = out[n, 3] = out[n, 5] = 1.0 / np.sqrt(mass[n])
+        w, x, y, z = quaternion[n, 0], quaternion[n, 1], quaternion[n, 2], quaternion[n, 3]
+        way[0, 0], way[0, 1], way[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+        way[1, 0], way[1, 1], way[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+        way[2, 0], way[2, 1], way[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        to = 6
+        for i in range(3):
+            for j in range(i, 3):
+                for k in range(3):
+                    out[n, to] += way[i, k] / np.sqrt(inertia[n, k]) * way[j, k]
+                to += 1
     return out
 
 

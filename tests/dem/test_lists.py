@@ -60,6 +60,15 @@ def among_blades():
     return scene
 
 
+def in_a_flow():
+    """Spheres in a cell that is sheared and changes its size."""
+    scene = Scene(0.3, (0, 0, 0), stiffness=1e4, period=(1.15,) * 3, shear_rate=3.0, strain_rate=(0.1, -0.2, 0.3))
+    grid = np.stack(np.meshgrid(*[0.23 * np.arange(5)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.11
+    speed = np.random.default_rng(5).normal(size=grid.shape)
+    scene.add_spheres(grid, 0.11, 1000.0, velocity=2.0 * speed + grid[:, [1, 1, 1]] * [3.0, 0, 0])
+    return scene
+
+
 def assert_same(found, expected, ranks):
     for name, column in expected.columns().items():
         # the rows of ghosts and of what follows differ: the lists may know of more ghosts
@@ -76,7 +85,7 @@ def forgetful(world):
 
 
 @pytest.mark.parallel(1, 2, 3)
-@pytest.mark.parametrize("make", [among_walls, among_surfaces, among_blades])
+@pytest.mark.parametrize("make", [among_walls, among_surfaces, among_blades, in_a_flow])
 def test_a_search_with_kept_lists_finds_what_a_fresh_one_finds(make):
     comm, scene = MPI.COMM_WORLD, make()
     world = new_world(scene, comm)
