@@ -131,8 +131,8 @@ class EntriesTrain:
         """Make a train of at most the rank that is asked for; the reason if there is no positive one.
 
         If the limit of operations ends the attempt, others with small ranks follow, each with twice the rank of the
-        last, until it ends one of these too. The train that leaves least is kept, so a large rank is no worse than a
-        small one.
+        last, until it ends one of these too. The train that leaves least is kept, so a large rank is rarely worse
+        than a small one.
         """
         start = None if self.options.reuse == "none" else self.compressed
         found, why = None, ""

@@ -14,8 +14,7 @@ from dem.contact.narrow import CORNERS
 from dem.mesh import Mesh
 from dem.motion import Glide, Rotation
 from dem.scene import Scene
-from dem.shapes import Box, Plane, Sphere
-from dem.shapes.clumps import Clump
+from dem.shapes import Box, Clump, Plane, Sphere
 from dem.start import new_world
 from dem.step import advanced
 from dem.step.system import ContactSystem
