@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from pctt.simulation import Settings as Settings
     from pctt.simulation import Simulation as Simulation
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 #: Where the names are at home. They are found at first use: PETSc starts with some, and ``petsc4py.init`` may come
 #: before, and a user of preconditioners alone needs none.
