@@ -81,9 +81,11 @@ def commit() -> str:
 
 
 def replace_section(page: Path, head: str, text: str) -> None:
-    """Write the text of a section of a page, which goes from its head to the next of that level."""
+    """Write the text of a section of a page, which goes from its head to the next of that level, if there is one."""
     before, _, after = page.read_text("utf-8").partition(head)
-    page.write_text(before + head + text + after[re.search("^## ", after, re.MULTILINE).start() :], "utf-8")
+    following = re.search("^## ", after, re.MULTILINE)
+    rest = after[following.start() :] if following else ""
+    page.write_text((before + head + text + rest).rstrip() + "\n", "utf-8")
     print(page)
 
 
