@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pctt.ccp.interior.pdip import PDIP, PerspectiveConstraint, _next_damping
+from pctt.ccp.interior.pdip import PDIP, Direction, Linearised, PerspectiveConstraint, Point, _next_damping
 
 
 def inside(count: int = 60, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -35,6 +35,22 @@ def test_gradient_and_hessian_are_the_derivatives():
     cone = PerspectiveConstraint(mu)
     assert np.allclose(cone.gradient(g), derivative(cone.value, g), rtol=1e-6, atol=1e-7)
     assert np.allclose(cone.hessian(g), derivative(cone.gradient, g), rtol=1e-6, atol=1e-7)
+
+
+def test_second_order_terms_are_what_a_step_leaves():
+    """Of complementarity lambda f, and of the part of lambda grad f in which lambda and the gradient both change."""
+    g, mu = inside()
+    cone, rng = PerspectiveConstraint(mu), np.random.default_rng(3)
+    lam, d = rng.uniform(0.5, 2.0, len(g)), Direction(0.1 * rng.normal(size=g.shape), rng.normal(size=len(g)))
+    at, rest = Point(g, np.zeros_like(g), lam), (None, 0.0, np.zeros_like(g), 0.0, None)
+    linear = Linearised(None, at, rest[0], cone.value(g), cone.gradient(g), cone.hessian(g), *rest[1:])
+    for reach in (1.0, 0.5):
+        curved, missed = linear.second_order(d, reach)
+        t = 1e-3  # second differences along the direction
+        values = [(lam + s * d.dlam) * cone.value(g + s * d.dg) for s in (-t, 0.0, t)]
+        assert np.allclose(missed, reach * (values[0] - 2 * values[1] + values[2]) / (2 * t * t), rtol=1e-4, atol=1e-6)
+        turned = (cone.gradient(g + t * d.dg) - cone.gradient(g - t * d.dg)) / (2 * t)
+        assert np.allclose(curved, reach * d.dlam[:, None] * turned, rtol=1e-4, atol=1e-6)
 
 
 def test_value_is_negative_inside_zero_on_the_surface_positive_outside():
