@@ -16,6 +16,7 @@ import statistics
 from argparse import Namespace
 from functools import partial
 
+import shared
 from shared import Row, Table, figure, markdown, medians, parser, record, say_machine, settled_steps
 
 STEPS, RANKS = 40, (1, 2)
@@ -52,6 +53,33 @@ def steps(given: Namespace, about: Row) -> None:
             table.add(rows[-1])
         print(f"    n = {n}: 1 rank / 2 ranks = {rows[-2]['seconds'] / rows[-1]['seconds']:.2f}")
     record("measure_steps", about, rows)
+    if given.n == [4, 8, 16]:
+        write_steps(rows, about)
+
+
+def write_steps(rows: list[Row], about: Row) -> None:
+    """The section of docs/measurements.md."""
+    lines = []
+    for row, last in zip(rows, [None, *rows]):
+        faster = f"{last['seconds'] / row['seconds']:.2f}" if last and row["ranks"] > 1 else ""
+        times = [f"{1e3 * row[name]:.3g}" for name in (*PHASES, "seconds")]
+        counts = [f"{row[name]:,.0f}" for name in ("contacts", "iterations")]
+        lines.append([row["n"], row["ranks"], *counts, *times, faster])
+    heads = ["n", "ranks", "contacts", "iterations", *(f"{name}, ms" for name in PHASES), "step, ms", "times faster"]
+    words = {"cpu": about["cpu"], "cores": about["cores"], "commit": shared.commit(), "table": markdown(heads, lines)}
+    page = shared.ROOT / "docs" / "measurements.md"
+    shared.replace_section(page, "## The phases of a time step\n", OF_STEPS.format(**words))
+
+
+OF_STEPS = """`run/study measure steps 4 8 16` writes this section: 40 steps of the settled mixer by the defaults,
+medians, on an {cpu} of {cores} cores, commit {commit}.
+
+{table}
+
+The search is made twice in nearly every step: some grain goes further than its margin, and the second search asks what
+it may meet.
+
+"""
 
 
 def laws(given: Namespace, about: Row) -> None:
