@@ -21,7 +21,7 @@ from dem.model.neighbourhood import Neighbourhood, refreshed
 from dem.model.world import World
 from dem.parts.cell import Cell
 from dem.quaternion import cross, length
-from dem.shapes.clumps import arms
+from dem.shapes.forms import arms
 from dem.unconstrained.drives import free_directions, free_turns
 
 if TYPE_CHECKING:

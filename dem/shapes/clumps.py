@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from dem import quaternion
-from dem.arrays import Floats, frozen
+from dem.arrays import Floats
 from dem.bodies import CLUMP
 from dem.compiled import loop
 from dem.shapes.forms import Form
@@ -36,6 +36,10 @@ class ClumpForm(Form):
     SCALES: ClassVar[bool] = False
 
     @property
+    def arm(self) -> float:
+        return float(np.linalg.norm(self.center, axis=1).max())
+
+    @property
     def size(self) -> Floats:
         """As of `Form`."""
         around = float((np.linalg.norm(self.center, axis=1) + self.radius).max())
@@ -44,13 +48,6 @@ class ClumpForm(Form):
     def described(self) -> dict[str, Any]:
         """As of `Form`: spheres."""
         return {"centres": self.center.tolist(), "radii": self.radius.tolist()}
-
-
-@cache
-def arms(forms: tuple[Form, ...]) -> Floats:
-    """How far (forms,) the centre of a sphere of a clump is from that of the clump, at most; 0 of other forms [m]."""
-    each = [np.linalg.norm(form.center, axis=1).max() if isinstance(form, ClumpForm) else 0.0 for form in forms]
-    return frozen(np.array(each, float))
 
 
 @cache

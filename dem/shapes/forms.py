@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
-from dem.arrays import Floats
+import numpy as np
+
+from dem.arrays import Floats, frozen
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +24,11 @@ class Form:
     SCALES: ClassVar[bool]  #: whether each grain has a scale of its own
 
     @property
+    def arm(self) -> float:
+        """How far the centre of a sphere of its surface is from the origin, at most [m]; 0 if it has no spheres."""
+        return 0.0
+
+    @property
     def size(self) -> Floats:
         """(3,) radii of the sphere about the origin that encloses it, of the ball of its volume, and of the largest
         sphere in it, as of `dem.bodies.Bodies` [m]."""
@@ -30,3 +38,9 @@ class Form:
         """Its surface as files have it: `centres` (k, 3) and `radii` (k,) of spheres [m], or `vertices` (v, 3) [m] and
         `triangles` (t, 3), rows of these."""
         raise NotImplementedError
+
+
+@cache
+def arms(forms: tuple[Form, ...]) -> Floats:
+    """Return the arms (forms,) of forms [m]."""
+    return frozen(np.array([form.arm for form in forms], float))

@@ -19,7 +19,7 @@ from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
 from dem.measures import Sample
 from dem.model.world import World
-from dem.shapes.clumps import arms
+from dem.shapes.forms import arms
 from dem.step.laws import along_normal
 from dem.step.system import ContactSystem, contact_arms, contact_frames, gap_velocities
 from dem.together import barrier
@@ -292,9 +292,9 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
     if world.only_spheres:
         return False
     grains, angle = world.grains, dt * quaternion.length(velocity[:, 3:])
-    way, clump = bodies.bounding_radius(grains) * angle, (grains.shape >= CLUMP) & (grains.shape < POLYHEDRON)
-    if clump.any():
-        way[clump] = arms(world.forms)[grains.shape[clump] - CLUMP] * angle[clump] ** 2
+    way, of_spheres = bodies.bounding_radius(grains) * angle, (grains.shape >= CLUMP) & (grains.shape < POLYHEDRON)
+    if of_spheres.any():
+        way[of_spheres] = arms(world.forms)[grains.shape[of_spheres] - CLUMP] * angle[of_spheres] ** 2
     fast, finite = bool((way[grains.shape != SPHERE] > depth).any()), bool(np.isfinite(velocity).all())
     fast, not_finite = on_any(world.comm, fast, not finite)
     return fast and not not_finite

@@ -70,9 +70,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     if pairs.restitution.any():
         old = old.copy()
         old[grains:] = motion.prescribed
-    image = np.zeros(contacts.normal.shape)
-    if world.cell.periodic:
-        image -= world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
+    image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     slow, radius = dt * math.hypot(*world.gravity), np.ascontiguousarray(table.size[:, 0])
     kind, bounce, offset, marked = struck(
         (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
