@@ -52,7 +52,8 @@ class View:
                 there = f"allowed is one of {', '.join(names) or 'none'}"
                 raise OptionError(f"bodies: there is no large body {name!r}; {there}{nearest(name, names)}")
             try:
-                found[names.index(name)] = to_rgba(colour)
+                with_alpha = isinstance(colour, tuple) and len(colour) == 2  # which matplotlib takes from 3.8 on
+                found[names.index(name)] = to_rgba(*colour) if with_alpha else to_rgba(colour)
             except ValueError:
                 allowed = "allowed is one that matplotlib knows, such as orange, #ff8800, #ff880080, none"
                 raise OptionError(f"bodies: the colour {colour!r} of {name!r}; {allowed}") from None
