@@ -218,7 +218,8 @@ def test_the_wheel_and_its_bed():
 def test_the_wheel_may_come_from_a_file(tmp_path):
     pytest.importorskip("trimesh", reason="trimesh is not installed (extra `meshes`)")
     profile = [(0, -0.5), (1, -0.5), (1, 0.5), (0, 0.5)]
-    Mesh.revolved(profile, 24, quaternion=(0.5**0.5, -(0.5**0.5), 0, 0)).write(tmp_path / "wheel.stl")
+    wheel = Mesh.revolved(profile, 24)  # about z; files have no pose
+    Mesh(np.array(wheel.vertices)[:, [0, 2, 1]] * [1, 1, -1], wheel.triangles).write(tmp_path / "wheel.stl")
     scene = Wheel(n=4, file=str(tmp_path / "wheel.stl"))
     (surface,) = scene.build().large_bodies[2].shapes
     assert np.linalg.norm(np.array(surface.vertices)[:, [0, 2]], axis=1).max() == pytest.approx(scene.wheel_radius)
