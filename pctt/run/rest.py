@@ -73,8 +73,8 @@ def with_islands(
 
 
 def account(world: World, limits: Limits, result: Result) -> None:
-    """Count what a step has spent beyond its limits if these iterations did not reach the aim; a step whose do may
-    spend all. Few contacts reach it by the conic method otherwise."""
+    """Count what a step has spent beyond its limits, unless these iterations reached the aim: then the next may spend
+    all. Where the conic method reached it, for few contacts, they did not."""
     if limits.spare and result.residual <= limits.aimed and not result.newton_its:
         world.spare = SPARE
     else:
