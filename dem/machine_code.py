@@ -7,6 +7,7 @@ machine code as well. So here files are named by a hash of all that was compiled
 from __future__ import annotations
 
 import enum
+import gc
 import hashlib
 import warnings
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 import numpy as np
-from numba.core import caching, config, types
+from numba.core import caching, config, event, types
 from numba.core.dispatcher import Dispatcher
 
 with suppress(ImportError):  # where there is colorama, numba lets it end every output by an escape sequence
@@ -24,6 +25,27 @@ with suppress(ImportError):  # where there is colorama, numba lets it end every 
     initialise.atexit_done = True
 
 _InTree: Any = getattr(caching, "InTreeCacheLocator", None) or caching._InTreeCacheLocator  # of older releases
+
+
+class _NoCollection(event.Listener):
+    """Keeps the collector of cycles, which finds nothing there and takes a seventh of the time, out of compilations."""
+
+    inner, wanted = 0, False
+
+    def on_start(self, event: Any) -> None:
+        if not self.inner:
+            self.wanted = gc.isenabled()
+            gc.disable()
+        self.inner += 1
+
+    def on_end(self, event: Any) -> None:
+        self.inner -= 1
+        if self.wanted and not self.inner:
+            gc.enable()
+
+
+event.register("numba:compile", _NoCollection())
+
 _PLAIN = (int, float, complex, str, bytes, type(None), np.generic, np.dtype, enum.Enum)
 
 

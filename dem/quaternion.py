@@ -101,14 +101,15 @@ def rotation_vector(before: Floats, after: Floats) -> Floats:
 
 
 @loop
-def integrate(q: Floats, angular_velocity: Floats, dt: float) -> Floats:
-    """Orientations (n, 4) after the time `dt` [s] at constant world-frame angular velocities (n, 3) [rad/s].
+def integrate(q: Floats, velocity: Floats, dt: float) -> Floats:
+    """Orientations (n, 4) after the time `dt` [s] at constant world-frame angular velocities [rad/s]: the last three
+    columns of `velocity` (n, 3 or more).
 
     q <- exp(dt w) q, renormalised so that the rounding of many steps does not add up.
     """
     out = np.empty((len(q), 4))
     for n in range(len(q)):
-        x, y, z = dt * angular_velocity[n, 0], dt * angular_velocity[n, 1], dt * angular_velocity[n, 2]
+        x, y, z = dt * velocity[n, -3], dt * velocity[n, -2], dt * velocity[n, -1]
         angle = np.sqrt(x * x + y * y + z * z)
         w = np.cos(0.5 * angle)
         share = np.sin(0.5 * angle) / angle if angle > 0.0 else 0.5

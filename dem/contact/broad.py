@@ -60,7 +60,7 @@ def pairs_in_cells(center: Floats, radius: Floats, first: Ints, second: Ints, al
 
     # Alike, the rows are taken in the order of their cells, each with those behind it: every pair comes once.
     rows, cells = member if alike else first, (largest, per, side, start, place, member)
-    pairs, found, done = np.empty((8 * len(first) + 8, 2), np.int64), 0, 0
+    pairs, found, done = np.empty((8 * len(first) + 8, 2), np.int64), np.int64(0), np.int64(0)
     while True:
         done, found = _pairs_of_rows((center, radius), rows, done, alike, cells, pairs, found)
         if done == len(rows):

@@ -325,8 +325,13 @@ def scale(root, v, out):
 
 
 @inlined
-def extrapolated(m, last_m, beta, i, k):
-    return m[i, k] + beta * (m[i, k] - last_m[i, k])
+def extrapolated(m, last_m, beta, i):
+    """The row i of m + beta (m - last_m)."""
+    return (
+        m[i, 0] + beta * (m[i, 0] - last_m[i, 0]), m[i, 1] + beta * (m[i, 1] - last_m[i, 1]),
+        m[i, 2] + beta * (m[i, 2] - last_m[i, 2]), m[i, 3] + beta * (m[i, 3] - last_m[i, 3]),
+        m[i, 4] + beta * (m[i, 4] - last_m[i, 4]), m[i, 5] + beta * (m[i, 5] - last_m[i, 5]),
+    )  # fmt: skip
 
 
 @loop
@@ -341,11 +346,8 @@ def scale_extrapolated(mass, m, last_m, beta, out):
             _scale_numbers(each[a:b], now[a:b], last[a:b], way, to[a:b])
     else:
         for i in prange(len(mass)):
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
-                mass, i, extrapolated(m, last_m, way, i, 0), extrapolated(m, last_m, way, i, 1),
-                extrapolated(m, last_m, way, i, 2), extrapolated(m, last_m, way, i, 3),
-                extrapolated(m, last_m, way, i, 4), extrapolated(m, last_m, way, i, 5),
-            )  # fmt: skip
+            u, v, w, x, y, z = extrapolated(m, last_m, way, i)
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(mass, i, u, v, w, x, y, z)
 
 
 @loop
@@ -379,12 +381,9 @@ def _energy_of_part(mass, new_m, m, last_m, beta):
             energy += sums[k]
         return energy
     for i in range(len(mass)):
-        d0 = new_m[i, 0] - extrapolated(m, last_m, beta, i, 0)
-        d1 = new_m[i, 1] - extrapolated(m, last_m, beta, i, 1)
-        d2 = new_m[i, 2] - extrapolated(m, last_m, beta, i, 2)
-        d3 = new_m[i, 3] - extrapolated(m, last_m, beta, i, 3)
-        d4 = new_m[i, 4] - extrapolated(m, last_m, beta, i, 4)
-        d5 = new_m[i, 5] - extrapolated(m, last_m, beta, i, 5)
+        u, v, w, x, y, z = extrapolated(m, last_m, beta, i)
+        d0, d1, d2 = new_m[i, 0] - u, new_m[i, 1] - v, new_m[i, 2] - w
+        d3, d4, d5 = new_m[i, 3] - x, new_m[i, 4] - y, new_m[i, 5] - z
         v0, v1, v2, v3, v4, v5 = scaled_row(mass, i, d0, d1, d2, d3, d4, d5)
         energy += d0 * v0 + d1 * v1 + d2 * v2 + d3 * v3 + d4 * v4 + d5 * v5
     return energy

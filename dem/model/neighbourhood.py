@@ -99,7 +99,8 @@ def seen_by(position: Floats, radius: Floats, ways: Floats, boxes: Floats) -> Bo
     """Whether balls (n,), moved by these ways (w, 3), touch a box of a rank (ranks, w, n); boxes (ranks, k, 2, 3)."""
     out = np.zeros((len(boxes), len(ways), len(radius)), np.bool_)
     for rank in range(len(boxes)):
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)  # about all of them
+        low, high = np.empty(3), np.empty(3)  # about all of them
+        low[:], high[:] = np.inf, -np.inf
         for box in boxes[rank]:
             for k in range(3):
                 low[k], high[k] = min(low[k], box[0, k]), max(high[k], box[1, k])

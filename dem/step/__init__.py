@@ -178,7 +178,7 @@ def advanced(world: World, free: UnconstrainedMotion, contacts: Contacts, veloci
 def _move(table: Bodies, velocity: Floats, dt: float) -> None:
     table.velocity = velocity.copy()
     table.position = table.position + dt * velocity[:, :3]
-    table.quaternion = quaternion.integrate(table.quaternion, velocity[:, 3:], dt)
+    table.quaternion = quaternion.integrate(table.quaternion, velocity, dt)
 
 
 def find_overrun(

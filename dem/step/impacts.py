@@ -166,7 +166,8 @@ def struck(
     (one, two, normal, gap), (ball, mass, radius, material) = contacts, spheres
     (place, velocity), (restitution, stiffness) = motions, laws
     count = len(one)
-    kind, bounce, offset = np.full(count, OTHER), np.empty(count), np.zeros((count, 3))
+    kind, bounce, offset = np.empty(count, np.int64), np.empty(count), np.zeros((count, 3))
+    kind[:] = OTHER
     meets, passes, marked = np.zeros(count, np.bool_), np.zeros(count, np.bool_), np.zeros(len(place), np.bool_)
     many = np.zeros(len(place), np.int64)
     for c in range(count):

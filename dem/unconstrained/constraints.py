@@ -135,7 +135,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
         after = velocity + np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
         if dt * np.abs(after[:, 3:]).max(initial=0.0) > FAR:
             break
-        place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after[:, 3:], dt)
+        place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after, dt)
         error = geometry(place, turn).error
         bent = (error - found.error)[which, coordinates] / dt - J.reshape(len(t), -1) @ after.ravel()
         t = np.where(held, left - bent, left)
