@@ -315,7 +315,8 @@ def _all_blocks(indptr, indices, blocks, start):
     found = 0
     for k in range(columns):
         found += (start[k + 1] - start[k]) ** 2
-    where, starts = np.full(count, -1, np.int64), np.zeros(count + 1, np.int32)
+    where, starts = np.empty(count, np.int64), np.zeros(count + 1, np.int32)
+    where[:] = -1
     near, out = np.empty(found + count, np.int32), np.zeros((found + count, 3, 3))
     for c in range(count):
         first = last = starts[c]

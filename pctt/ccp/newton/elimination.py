@@ -101,8 +101,9 @@ class Factors:
 @loop
 def _ordered(indptr, indices, full, least, most):
     count, pairs = len(indptr) - 1, 0
-    place = np.full((count, count), -1, np.int32)  # -1: not neighbours; 0: they are; else 1 + the place of the block
-    degree = np.zeros(count, np.int64)
+    place = np.empty((count, count), np.int64)  # -1: not neighbours; 0: they are; else 1 + the place of the block
+    number, order, degree = np.empty(count, np.int64), np.empty(count, np.int64), np.zeros(count, np.int64)
+    place[:], number[:] = -1, -1
     for i in range(count):
         for p in range(indptr[i], indptr[i + 1]):
             j = indices[p]
@@ -110,7 +111,6 @@ def _ordered(indptr, indices, full, least, most):
                 place[i, j] = place[j, i] = 0
                 degree[i] += 1
                 degree[j] += 1
-    number, order = np.full(count, -1, np.int64), np.empty(count, np.int64)
     starts, rows, near = np.zeros(count + 1, np.int64), np.empty(4 * count, np.int64), np.empty(count, np.int64)
     head = 0
     while head < count:
@@ -186,8 +186,8 @@ def _place(S, order, lower, upper):
     for c in range(len(number)):
         i = number[c]
         at = i if i < head else head + starts[head] + (i - head) * (rest + 1)
-        lower[at] = diagonal[c]
-        upper[at] = diagonal[c].T
+        _copy(diagonal, c, lower, at, False)
+        _copy(diagonal, c, upper, at, True)
         for p in range(indptr[c], indptr[c + 1]):
             j = number[indices[p]]
             if j == i:
@@ -196,11 +196,21 @@ def _place(S, order, lower, upper):
             if low >= head:
                 at = head + starts[head] + (high - head) * rest + low - head
             else:
-                at = head + starts[low] + np.searchsorted(rows[starts[low] : starts[low + 1]], high)
+                at = starts[low]
+                while rows[at] < high:  # columns are short
+                    at += 1
+                at += head
             if i == high:
-                lower[at] = blocks[p]
+                _copy(blocks, p, lower, at, False)
             else:
-                upper[at] = blocks[p].T
+                _copy(blocks, p, upper, at, True)
+
+
+@inlined
+def _copy(blocks, k, to, at, transposed):
+    for r in range(3):
+        for c in range(3):
+            to[at, r, c] = blocks[k, c, r] if transposed else blocks[k, r, c]
 
 
 @inlined
