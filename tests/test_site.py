@@ -137,7 +137,7 @@ def test_the_search_finds_the_words_of_users(site):
     missed = {}
     for word, wanted in WORDS.items():
         page.open(f"{address}/search.html?q={word.replace(' ', '+')}", 1400)
-        found = page.value(f"""new CostEstimate(done => {{ const look = () => {{
+        found = page.value(f"""new Promise(done => {{ const look = () => {{
             const all = {results};
             const said = document.querySelector('#search-results p.search-summary')?.innerText;
             if (said?.match(/\\d|one page|not match/)) done(all);
