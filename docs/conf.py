@@ -68,9 +68,11 @@ def as_text(app, what, name, obj, options, lines: list[str]) -> None:
 
 
 def mark_long_cells(app, doctree, name: str) -> None:
-    """Cells of tables with several words are not to be narrow: _static/tables.css."""
+    """Cells of tables with several words are not to be narrow, and many columns are to be: _static/tables.css."""
     from docutils import nodes
 
+    for group in doctree.findall(nodes.tgroup):
+        group.parent["classes"] += ["wide"] * (group["cols"] >= 12)
     for cell in doctree.findall(nodes.entry):
         words = len(cell.astext().split())
         cell["classes"] += ["long"] * (words > 10) or ["some"] * (words > 2)
