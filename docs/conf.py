@@ -11,9 +11,13 @@ DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS.parent), str(DOCS)]
 
 import petsc4py
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.transforms import SphinxTransform
 
 petsc4py.init([])  # before modules of pctt take what the command line of sphinx-build says
 
+import index_words
 import pages
 
 import pctt
@@ -39,6 +43,7 @@ html_title = f"pctt {release}"  # at the head of every page
 # one file of MathJax, so that formulas show without a network
 mathjax = Path(importlib.util.find_spec("sphinx-mathjax-offline").origin).parent / "static" / "mathjax" / "tex-svg.js"
 html_static_path = ["_static", str(mathjax)]
+html_search_scorer = str(DOCS / "scorer.js")
 html_show_search_summary = False  # the search would need a server
 html_css_files = ["tables.css"]
 html_favicon = "_static/icon.svg"
@@ -69,8 +74,6 @@ def as_text(app, what, name, obj, options, lines: list[str]) -> None:
 
 def mark_long_cells(app, doctree, name: str) -> None:
     """Cells of tables with several words are not to be narrow, and many columns are to be: _static/tables.css."""
-    from docutils import nodes
-
     for group in doctree.findall(nodes.tgroup):
         group.parent["classes"] += ["wide"] * (group["cols"] >= 12)
     for cell in doctree.findall(nodes.entry):
@@ -78,7 +81,24 @@ def mark_long_cells(app, doctree, name: str) -> None:
         cell["classes"] += ["long"] * (words > 10) or ["some"] * (words > 2)
 
 
+class IndexWords(SphinxTransform):
+    """The words of index_words.py become entries of the index, at their headings."""
+
+    default_priority = 700  # before the index is made of the entries
+
+    def apply(self, **kwargs) -> None:
+        words = dict(index_words.WORDS.get(self.env.docname, {}))
+        for k, section in enumerate(list(self.document.findall(nodes.section))):
+            found = words.pop(section[0].astext(), "") if k else words.pop("", "")
+            entries = [("single", word, section["ids"][0], "main", None) for word in found.split(", ") if word]
+            if entries:
+                section.insert(1, addnodes.index(entries=entries))
+        if words:
+            raise ValueError(f"index_words.py: {self.env.docname} has no headings {', '.join(words)}")
+
+
 def setup(app) -> None:
+    app.add_transform(IndexWords)
     app.connect("autodoc-process-docstring", as_text, priority=100)  # before napoleon
     app.connect("doctree-resolved", mark_long_cells)
     pages.write(Path(app.srcdir))
