@@ -54,12 +54,15 @@ autodoc_typehints = "none"  # the docstrings say shapes and units
 autodoc_default_options = {"members": True}
 
 
+COLON = "\ue000"  #: in the place of a colon
+
+
 def as_text(app, what, name, obj, options, lines: list[str]) -> None:
     """Docstrings are text with formulas in it: |g| is no substitution and g* no emphasis, but within ``literals``.
     Where there are no sections of numpydoc, lines such as "name, other : meaning" become fields."""
     sections = any(line.startswith("---") for line in lines)
-    if what in ("attribute", "property"):
-        lines.insert(0, "")  # else napoleon takes words before a colon for a type
+    if what in ("attribute", "property") and lines:
+        lines[0] = lines[0].replace(":", COLON)  # else napoleon takes the words before it for a type
     if sections:  # a doctest after the last section is none of its parameters
         starts = [i for i, line in enumerate(lines) if line.startswith(">>>") and not lines[i - 1]]
         lines[:] = lines[: starts[0]] + ["Examples", "--------"] + lines[starts[0] :] if starts else lines
@@ -72,10 +75,17 @@ def as_text(app, what, name, obj, options, lines: list[str]) -> None:
         lines[i] = "``".join(parts)
 
 
+def colons_again(app, what, name, obj, options, lines: list[str]) -> None:
+    lines[:] = [line.replace(COLON, ":") for line in lines]
+
+
 def mark_long_cells(app, doctree, name: str) -> None:
-    """Cells of tables with several words are not to be narrow, and many columns are to be: _static/tables.css."""
+    """Cells of tables with several words are not to be narrow, many columns are to be, and options are not to end a line
+    after their hyphen: _static/tables.css."""
     for group in doctree.findall(nodes.tgroup):
         group.parent["classes"] += ["wide"] * (group["cols"] >= 12)
+    for code in doctree.findall(nodes.literal):
+        code["classes"] += ["option"] * (code.astext().startswith("-") and len(code.astext()) <= 24)
     for cell in doctree.findall(nodes.entry):
         words = len(cell.astext().split())
         cell["classes"] += ["long"] * (words > 10) or ["some"] * (words > 2)
@@ -100,5 +110,6 @@ class IndexWords(SphinxTransform):
 def setup(app) -> None:
     app.add_transform(IndexWords)
     app.connect("autodoc-process-docstring", as_text, priority=100)  # before napoleon
+    app.connect("autodoc-process-docstring", colons_again, priority=900)  # after it
     app.connect("doctree-resolved", mark_long_cells)
     pages.write(Path(app.srcdir))
