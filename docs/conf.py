@@ -66,10 +66,16 @@ def as_text(app, what, name, obj, options, lines: list[str]) -> None:
     if sections:  # a doctest after the last section is none of its parameters
         starts = [i for i, line in enumerate(lines) if line.startswith(">>>") and not lines[i - 1]]
         lines[:] = lines[: starts[0]] + ["Examples", "--------"] + lines[starts[0] :] if starts else lines
+    if "Attributes" in lines:  # one line for each: napoleon takes the first one for a type, the others for a text
+        start = lines.index("Attributes") + 2
+        end = lines.index("", start) if "" in lines[start:] else len(lines)
+        lines[start:end] = re.sub(r"\n +", " ", "\n".join(lines[start:end])).split("\n")
     for i, line in enumerate(lines):
         if line.startswith((">>>", "...")):
             continue
         line = line if sections else re.sub(r"^([a-z]\w*(?:, \w+)*) : ", r":\1: ", line)
+        if "Attributes" in lines:  # else sphinx takes the first of several names for a type
+            line = re.sub(r"^\w+(, \w+)+(?= : )", lambda names: names[0].replace(", ", ",\u2060"), line)
         parts = line.split("``")
         parts[::2] = [re.sub(r"([|*]|_(?=\W|$))", r"\\\1", part) for part in parts[::2]]
         lines[i] = "``".join(parts)
@@ -80,8 +86,8 @@ def colons_again(app, what, name, obj, options, lines: list[str]) -> None:
 
 
 def mark_long_cells(app, doctree, name: str) -> None:
-    """Cells of tables with several words are not to be narrow, many columns are to be, and options are not to end a line
-    after their hyphen: _static/tables.css."""
+    """Cells of tables with several words are not to be narrow, many columns are to be, and no line ends after the
+    hyphen of an option: _static/tables.css."""
     for group in doctree.findall(nodes.tgroup):
         group.parent["classes"] += ["wide"] * (group["cols"] >= 12)
     for code in doctree.findall(nodes.literal):

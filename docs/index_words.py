@@ -64,6 +64,9 @@ WORDS = {
         "Beds of other programs": "LAMMPS, Yade, import",
     },
     "trains": {"": "tensor train, dense matrix"},
-    "tutorial": {"Bodies and materials": "gravity, density, wall, container", "Motions of large bodies": "motion, rotation"},
+    "tutorial": {
+        "Bodies and materials": "gravity, density, wall, container",
+        "Motions of large bodies": "motion, rotation",
+    },
     "validation": {"What was done": "heap, silo flow, benchmark"},
 }
