@@ -187,15 +187,6 @@ class BodyMatrix:
         kept[self._diagonal] = True
         return Part(self._indptr(self._row[kept]), self._indices[kept], self._values[kept])
 
-    def stiff_mat(self, least: float, symmetric: bool = True) -> PETSc.Mat:
-        """The same of all ranks as a new AIJ Mat, because external packages have no code for blocks."""
-        indptr, indices, blocks = self.stiff_part(least)
-        rows = sp.bsr_matrix((blocks, indices, indptr), shape=(self._sizes[0][0], 6 * self._total)).tocsr()
-        csr = (rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType), rows.data)
-        mat = new_matrix(self.comm, self._sizes, 6, csr, PETSc.Mat.Type.AIJ)
-        mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
-        return mat
-
     def places(self, points: Array) -> Array:
         """Places (n, 3) of this rank's bodies: the means of their contact points. ``points`` (nc, 3); collective."""
         sums = PETSc.Vec().createMPI(self._sizes[0], bsize=6, comm=self.comm)  # of points, and their number

@@ -1,4 +1,4 @@
-"""Cholesky factors by fronts against dense algebra, and the order of nested dissection."""
+"""Factors by fronts against dense algebra, and the order of nested dissection."""
 
 from __future__ import annotations
 
@@ -44,6 +44,14 @@ def rows_of(part: Part, comm: MPI.Comm) -> tuple[Part, slice]:
     return Part(part.indptr[begin : end + 1] - a, part.indices[a:b], part.blocks[a:b]), slice(begin, end)
 
 
+def skewed(part: Part) -> Part:
+    """The same with blocks that are not symmetric, of which some are there in one half only."""
+    rng, row = np.random.default_rng(3), np.repeat(np.arange(len(part.indptr) - 1), np.diff(part.indptr))
+    kept = (row <= part.indices) | (rng.random(len(row)) > 0.1)
+    blocks = part.blocks * rng.uniform(0.7, 1.3, part.blocks.shape)
+    return Part(np.r_[0, np.cumsum(np.bincount(row[kept]))], part.indices[kept], blocks[kept])
+
+
 def dense(part: Part) -> np.ndarray:
     return sp.bsr_matrix((part.blocks, part.indices, part.indptr)).toarray()
 
@@ -52,12 +60,15 @@ def dense(part: Part) -> np.ndarray:
 @pytest.mark.parametrize(("precision", "accuracy"), [(np.float32, 3e-2), (np.float64, 1e-10)])
 @pytest.mark.parametrize("hub", [False, True])
 @pytest.mark.parametrize("known", [False, True])
-def test_the_factors_solve(precision, accuracy, hub, known):
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_the_factors_solve(precision, accuracy, hub, known, symmetric):
     """Also where places are not known, with a body that touches hundreds, with bodies that touch none, and with a rank
     that has no bodies."""
     comm, (part, points) = MPI.COMM_WORLD, stiff(hub=hub)
+    if not symmetric:
+        part = skewed(part)
     rows, here = rows_of(part, comm)
-    factors = MultifrontalFactors(comm, rows, points[here] if known else None, precision)
+    factors = MultifrontalFactors(comm, rows, points[here] if known else None, precision, symmetric=symmetric)
     x = np.random.default_rng(1).standard_normal((len(points), 6))
     found = factors.solve((dense(part) @ x.ravel()).reshape(-1, 6)[here].ravel())
     assert np.linalg.norm(found - x[here].ravel()) <= accuracy * np.linalg.norm(x)

@@ -17,8 +17,6 @@ INCOMPLETE: Options = {"pc_type": "python", "pc_python_type": "pctt.pc.BlockICC"
 #: where a KSP fails: factors, by whether the matrix is symmetric
 _FACTORS: Options = {"ksp_type": "gmres", "ksp_gmres_restart": "60", "ksp_max_it": "60"}
 DIRECT = {True: {**_FACTORS, "pc_type": "cholesky"}, False: {**_FACTORS, "pc_type": "lu"}}
-#: our own factors of the part of a symmetric K that is worth it
-MULTIFRONTAL: Options = {
-    **_FACTORS, "ksp_type": "cg", "ksp_norm_type": "unpreconditioned",
-    "pc_type": "python", "pc_python_type": "pctt.ccp.newton.multifrontal.MultifrontalPC",
-}  # fmt: skip
+#: our own factors of the part of K that is worth it, by whether K is symmetric
+_FRONTS: Options = {**_FACTORS, "pc_type": "python", "pc_python_type": "pctt.ccp.newton.multifrontal.MultifrontalPC"}
+MULTIFRONTAL = {True: {**_FRONTS, "ksp_type": "cg", "ksp_norm_type": "unpreconditioned"}, False: _FRONTS}

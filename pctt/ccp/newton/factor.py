@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -64,12 +63,12 @@ class Room:
 
 
 class Factor:
-    """Factors of one matrix after another: our own of the bodies' where that is symmetric, else PETSc's, of all of it
-    or of the part of the bodies' that is worth it. A matrix keeps its factor for all right-hand sides."""
+    """Factors of one matrix after another: our own of the part of the bodies' that is worth it, else PETSc's. A matrix
+    keeps its factor for all right-hand sides."""
 
     def __init__(self, comm: MPI.Comm, room: Room):
         self.comm, self.room = comm, room
-        self._made: dict[str, Krylov] = {}
+        self._made: dict[tuple[str, str], Krylov] = {}
         self.begin()
 
     def begin(self) -> None:
@@ -83,7 +82,7 @@ class Factor:
     def solve(self, system: System, b: PETSc.Vec, x: PETSc.Vec, rtol: float) -> tuple[Solve | None, int]:
         """x = A^-1 b to a relative residual of rtol, and the iterations; None if the memory has no room."""
         options = system.factored_by
-        kind = options["pc_type"]
+        kind = options["ksp_type"], options["pc_type"]
         if kind not in self._made:
             self._made[kind] = Krylov(self.comm, OWN + "fallback_", options)
         solver = self._made[kind]
@@ -94,8 +93,7 @@ class Factor:
             solver.forget()  # first, as its memory counts as taken
             if not self._has_room(system):
                 return None, 0
-        with nullcontext() if self._factored else system.to_factor(LEAST) as part:
-            done = solver.solve(system.matrix, b, x, rtol, part, keep=self._factored)
+        done = solver.solve(system.matrix, b, x, rtol, system.entries, keep=self._factored)
         self._factored = self._factored or done.converged
         return done, done.iterations
 
@@ -127,7 +125,7 @@ class Factor:
         return done, count
 
     def _has_room(self, system: System, part: float = 1.0) -> bool:
-        room = self.room.takes(system.matrix.getSize()[0], part)
+        room = self.room.takes(system.matrix.getSize()[0], part if system.symmetric else 2.0 * part)
         self.room.refused = self.room.refused or not room
         return room
 

@@ -15,8 +15,7 @@ has the multipliers as unknowns too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Union
 
@@ -32,7 +31,6 @@ from pctt.ccp.delassus import GivenMatrix
 from pctt.ccp.newton.defaults import DIRECT, MULTIFRONTAL, Options
 from pctt.ccp.newton.elimination import Order
 from pctt.ccp.newton.kkt import KKT
-from pctt.ccp.newton.krylov import Pmat
 from pctt.ccp.newton.multifrontal import Dissection, MultifrontalFactors
 
 if TYPE_CHECKING:
@@ -160,11 +158,6 @@ class ContactForm(Form):
         """Options of the solver that makes factors."""
         return DIRECT[self.symmetric]
 
-    @contextmanager
-    def to_factor(self, least: float) -> Iterator[Pmat]:
-        """What is to be factorised."""
-        yield self.entries
-
     def destroy(self) -> None:
         if "_mat" in self.__dict__:
             self._mat.destroy()
@@ -243,19 +236,15 @@ class BodyForm(Form):
 
     @property
     def factored_by(self) -> Options:
-        return MULTIFRONTAL if self.symmetric else DIRECT[False]
-
-    @contextmanager
-    def to_factor(self, least: float) -> Iterator[Pmat]:
-        """K without blocks below ``least`` (`BodyMatrix.stiff_part`), in scalar rows."""
-        part = self.operator.entries().stiff_mat(least, self.symmetric)
-        yield part
-        part.destroy()  # the KSP keeps it
+        return MULTIFRONTAL[self.symmetric]
 
     def fronts(self, least: float, precision: type[np.floating]) -> MultifrontalFactors:
-        """The factors of this part, which is symmetric; all of a problem in the order of the first. Collective."""
+        """The factors of K without blocks below ``least`` (`BodyMatrix.stiff_part`); all of a problem in the order of
+        the first. Collective."""
         part = self.operator.entries().stiff_part(least)
-        fronts = MultifrontalFactors(self.problem.comm, part, self.places(), precision, self._dissection)
+        fronts = MultifrontalFactors(
+            self.problem.comm, part, self.places(), precision, self._dissection, self.symmetric
+        )
         self._dissection = fronts.dissection
         return fronts
 

@@ -1,11 +1,13 @@
-"""Cholesky factors of matrices of 6 x 6 blocks by fronts, in single or double precision, as a preconditioner.
+"""Factors of matrices of 6 x 6 blocks by fronts, in single or double precision, as a preconditioner: L L' of
+symmetric ones, L U of others.
 
 The bodies are ordered by nested dissection: of each part the bodies in the middle, by place, have the fewest that keep
 its two ends apart; these separate it in two halves; and so on. The bodies of a separator, or of a part that is not cut
 further, make a *front*: a dense matrix of their columns and of the rows that these touch, which LAPACK factorises. So
 nearly all work is that of dense matrices, and single precision is twice as fast and takes half of the memory. As a
 preconditioner it is enough for all but the last systems of an interior point method, if the matrix is scaled first so
-that its diagonal blocks are the identity.
+that its diagonal blocks are the identity. Of a matrix that is not symmetric the entries above the diagonal are kept as
+those below it of its transpose, and rows are swapped within a front only.
 
 On several ranks the first cuts part the bodies among them. Each rank factorises the fronts of its part; those of the
 first separators, to which all parts add, all ranks factorise alike. A rank keeps its own fronts and these.
@@ -44,12 +46,15 @@ FAR = 1000  # bodies there that count as much as one beyond
 
 
 class Front(NamedTuple):
-    """The rows ``own`` of a front and those that its columns touch (``rest``), with L of both in Fortran order."""
+    """The rows ``own`` of a front and those that its columns touch (``rest``), in Fortran order: L of both; or L and U
+    in one ``diagonal``, L ``below``, U' of the rest (``beside``), and the rows of its own as they were ``swapped``."""
 
     own: slice
     rest: np.ndarray
     diagonal: np.ndarray
     below: np.ndarray
+    beside: np.ndarray | None = None
+    swapped: np.ndarray | None = None
 
 
 class Dissection(NamedTuple):
@@ -85,13 +90,17 @@ class Dissection(NamedTuple):
         return np.append(self.rank, -1)[self.front_of(np.arange(len(self.order)))]
 
 
-#: Of a front: what earlier ones leave in the lower triangle of some bodies, and these.
+#: Where each column of an ordered matrix begins, its rows below the diagonal, and their blocks.
+Columns = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+#: Of a front: what earlier ones leave in the columns of some bodies (in the lower triangle), and these.
 Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 
 
 class MultifrontalFactors:
-    """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted; collective. LinAlgError or
-    MemoryError on all ranks if such a block of any is not positive definite, or one has no room.
+    """L L' of a matrix, scaled to the identity in its diagonal blocks and a little shifted, or L U of one that is not
+    ``symmetric``; collective. LinAlgError or MemoryError on all ranks if such a block of any is not positive definite,
+    or one has no room.
 
     part : the rows of this rank's bodies
     points : (n, 1 to 3) places of these bodies, in any unit; None on all ranks where they are not known
@@ -102,7 +111,7 @@ class MultifrontalFactors:
 
     def __init__(
         self, comm: MPI.Comm, part: Part, points: Array | None, precision: type[np.floating] = np.float32,
-        given: Dissection | None = None,
+        given: Dissection | None = None, symmetric: bool = True,
     ):  # fmt: skip
         indptr, column, blocks = part
         starts = offsets(comm, len(indptr) - 1)
@@ -111,24 +120,29 @@ class MultifrontalFactors:
         if given is None or on_any(comm, not given.fits(row, column))[0]:
             given = _dissection(comm, points, row, column, count)
         self.dissection, self._comm, self._precision = given, comm, precision
-        root = _on_all(comm, lambda: np.linalg.inv(np.linalg.cholesky(blocks[row == column])))
+        left, right = _on_all(comm, lambda: _roots(blocks[row == column], symmetric))
         new, rank = given.places, given.ranks
-        self._here, self._root = new[here], root.astype(precision)
+        self._here, self._left, self._right = new[here], left.astype(precision), right.astype(precision)
         self._of_all, self._kept = rank < 0, (rank == comm.rank) | ((rank < 0) & (comm.rank == 0))
-        below, roots = new[row] > new[column], np.concatenate(comm.allgather(root))
-        row, column = row[below], column[below]
-        scaled = (roots[row] @ blocks[below] @ roots[column].transpose(0, 2, 1)).astype(precision)
-        columns = _columns(comm, given, new[row], new[column], scaled)
+        left, right = (np.concatenate(comm.allgather(roots)) for roots in (left, right))
+
+        def scaled(which: np.ndarray) -> np.ndarray:
+            return (left[row[which]] @ blocks[which] @ right[column[which]].transpose(0, 2, 1)).astype(precision)
+
+        i, j = new[row], new[column]
+        sides = [_columns(comm, given, i[i > j], j[i > j], scaled(i > j))]
+        if not symmetric:
+            sides.append(_columns(comm, given, j[i < j], i[i < j], scaled(i < j).transpose(0, 2, 1)))
         own, shared = np.flatnonzero(given.rank == comm.rank), np.flatnonzero(given.rank < 0)
         updates: Updates = {}
-        self.own = _on_all(comm, lambda: _factorised(own, given.first, *columns, updates))
+        self.own = _on_all(comm, lambda: _factorised(own, given.first, sides, updates))
         every = _of_all_ranks(comm, updates, np.dtype(precision))
-        self.shared = _on_all(comm, lambda: _factorised(shared, given.first, *columns, every))
+        self.shared = _on_all(comm, lambda: _factorised(shared, given.first, sides, every))
 
     def solve(self, b: Array) -> Array:
         """About A^-1 b, for this rank's b (6 n,) in double precision; collective."""
         x = np.zeros((len(self._kept), 6), self._precision)
-        x[self._here] = (self._root @ b.reshape(-1, 6, 1).astype(self._precision))[:, :, 0]
+        x[self._here] = (self._left @ b.reshape(-1, 6, 1).astype(self._precision))[:, :, 0]
         x = self._summed(x)
         x[~self._kept] = 0
         self._forwards(self.own, x.ravel())
@@ -138,7 +152,7 @@ class MultifrontalFactors:
         self._backwards(self.own, x.ravel())
         x[~self._kept] = 0
         x = self._summed(x)
-        return (x[self._here, None] @ self._root).astype(float).ravel()
+        return (x[self._here, None] @ self._right).astype(float).ravel()
 
     def _summed(self, x: np.ndarray) -> np.ndarray:
         """The sum over the ranks."""
@@ -148,14 +162,30 @@ class MultifrontalFactors:
 
     def _forwards(self, fronts: list[Front], x: np.ndarray) -> None:
         trsv = blas.get_blas_funcs("trsv", dtype=self._precision)
-        for own, rest, diagonal, below in fronts:
-            x[own] = trsv(diagonal, x[own], lower=1)
+        for own, rest, diagonal, below, _, swapped in fronts:
+            if swapped is None:
+                x[own] = trsv(diagonal, x[own], lower=1)
+            else:
+                x[own] = trsv(diagonal, x[own][swapped], lower=1, diag=1)
             x[rest] -= below @ x[own]
 
     def _backwards(self, fronts: list[Front], x: np.ndarray) -> None:
         trsv = blas.get_blas_funcs("trsv", dtype=self._precision)
-        for own, rest, diagonal, below in reversed(fronts):
-            x[own] = trsv(diagonal, x[own] - below.T @ x[rest], lower=1, trans=1)
+        for own, rest, diagonal, below, beside, _ in reversed(fronts):
+            if beside is None:
+                x[own] = trsv(diagonal, x[own] - below.T @ x[rest], lower=1, trans=1)
+            else:
+                x[own] = trsv(diagonal, x[own] - beside.T @ x[rest])
+
+
+def _roots(diagonal: Array, symmetric: bool) -> tuple[Array, Array]:
+    """Of diagonal blocks D (n, 6, 6) the R and S with R D S' = 1, equal ones if D is symmetric; else S is diagonal."""
+    if symmetric:
+        root = np.linalg.inv(np.linalg.cholesky(diagonal))
+        return root, root
+    size = np.abs(np.diagonal(diagonal, axis1=1, axis2=2))
+    right = np.eye(6) / np.sqrt(np.maximum(size, np.finfo(float).tiny))[:, :, None]
+    return np.linalg.inv(diagonal @ right), right
 
 
 def _on_all(comm: MPI.Comm, work: Callable[[], Out]) -> Out:
@@ -172,9 +202,8 @@ def _on_all(comm: MPI.Comm, work: Callable[[], Out]) -> Out:
 
 def _columns(
     comm: MPI.Comm, found: Dissection, row: np.ndarray, column: np.ndarray, blocks: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The columns below the diagonal of this rank's fronts and of those of all, from the entries that the ranks have:
-    where each of the ordered matrix begins, rows, blocks."""
+) -> Columns:
+    """The columns of this rank's fronts and of those of all, from the entries that the ranks have."""
     rank = found.rank[found.front_of(column)]
     lower, shared = {"row": row, "column": column, "blocks": blocks}, rank < 0
     parts = comm.allgather({name: values[shared] for name, values in lower.items()})
@@ -184,34 +213,33 @@ def _columns(
     return np.searchsorted(column[order], np.arange(len(found.order) + 1)), row[order], blocks[order]
 
 
-def _factorised(
-    which: np.ndarray, first: np.ndarray, starts: np.ndarray, rows: np.ndarray, blocks: np.ndarray, updates: Updates
-) -> list[Front]:
-    """Some fronts, ascending, of the ordered matrix, whose columns below the diagonal have the ``rows`` and ``blocks``
-    from ``starts`` on; ``first`` says where each front begins, and the number of bodies. What they leave to others is
-    added to the ``updates``."""
+def _factorised(which: np.ndarray, first: np.ndarray, sides: list[Columns], updates: Updates) -> list[Front]:
+    """Some fronts, ascending, of the ordered matrix, from its columns and, if it is not symmetric, those of its
+    transpose; ``first`` says where each front begins, and the number of bodies. What they leave to others is added to
+    the ``updates``."""
     fronts: list[Front] = []
-    trsm, syrk = blas.get_blas_funcs(("trsm", "syrk"), dtype=blocks.dtype)
-    place = np.zeros(len(starts), np.int64)
+    factorise: Callable[..., tuple[tuple, np.ndarray]] = _cholesky if len(sides) == 1 else _lu
+    kind, place = sides[0][2].dtype, np.zeros(len(sides[0][0]), np.int64)
     for k in which.tolist():
         begin, end, added = first[k], first[k + 1], updates.pop(k, [])
-        touched = [rows[starts[begin] : starts[end]], *(bodies for bodies, _ in added)]
-        bodies = np.unique(np.concatenate(touched))
+        touched = [rows[starts[begin] : starts[end]] for starts, rows, _ in sides]
+        bodies = np.unique(np.concatenate([*touched, *(bodies for bodies, _ in added)]))
         bodies = bodies[np.searchsorted(bodies, end) :]
         own, rest = 6 * (end - begin), 6 * len(bodies)
-        shapes = (own, own), (rest, own), (rest, rest)
-        diagonal, below, update = (np.zeros(shape, blocks.dtype, "F") for shape in shapes)
+        diagonal, update = (np.zeros((size, size), kind, "F") for size in (own, rest))
+        parts = [np.zeros((rest, own), kind, "F") for _ in sides]
         place[begin:end], place[bodies] = np.arange(end - begin), np.arange(len(bodies))
-        add_columns(starts, rows, blocks, begin, end, place, diagonal, below)
-        for others, values in added:
-            add_update(values, others, end, place, diagonal, below, update)
-        diagonal = _cholesky(diagonal)
+        diagonal[np.arange(own), np.arange(own)] = ONE
+        for side, (columns, part) in enumerate(zip(sides, parts)):
+            to = (diagonal.T, part, update.T) if side else (diagonal, part, update)
+            add_columns(*columns, begin, end, place, to[:2])
+            for others, values in added:
+                add_update(values.T if side else values, others, end, place, to, side)
+        front, update = factorise(diagonal, *parts, update)
         if rest:
-            below = trsm(1.0, diagonal, below, side=1, lower=1, trans_a=1, overwrite_b=1)
-            update = syrk(-1.0, below, beta=1.0, c=update, lower=1, overwrite_c=1)
             updates.setdefault(int(np.searchsorted(first, bodies[0], "right")) - 1, []).append((bodies, update))
         entries = (6 * bodies[:, None] + np.arange(6)).ravel()
-        fronts.append(Front(slice(6 * begin, 6 * end), entries, diagonal, below))
+        fronts.append(Front(slice(6 * begin, 6 * end), entries, *front))
     return fronts
 
 
@@ -231,16 +259,39 @@ def _of_all_ranks(comm: MPI.Comm, updates: Updates, kind: np.dtype) -> Updates:
     return every
 
 
-def _cholesky(matrix: np.ndarray) -> np.ndarray:
-    """L of a matrix (lower triangle) with a little more on its diagonal: where rounding has made it indefinite, ten
-    times more than before."""
+def _cholesky(matrix: np.ndarray, below: np.ndarray, update: np.ndarray) -> tuple[tuple, np.ndarray]:
+    """L of a front (lower triangle) with a little more on its diagonal: where rounding has made it indefinite, ten
+    times more than before; and the update less what it takes."""
     shift, wrong, L, where = SHIFT * np.finfo(matrix.dtype).eps, 1, matrix, np.arange(len(matrix))
     potrf = lapack.get_lapack_funcs("potrf", dtype=matrix.dtype)
+    trsm, syrk = blas.get_blas_funcs(("trsm", "syrk"), dtype=matrix.dtype)
     while wrong and shift < 1.0:
         matrix[where, where] += matrix.dtype.type(shift)
         L, wrong = potrf(matrix, lower=1, clean=0)
         shift *= 10.0
-    return L
+    if len(below):
+        below = trsm(1.0, L, below, side=1, lower=1, trans_a=1, overwrite_b=1)
+        update = syrk(-1.0, below, beta=1.0, c=update, lower=1, overwrite_c=1)
+    return (L, below), update
+
+
+def _lu(
+    matrix: np.ndarray, below: np.ndarray, beside: np.ndarray, update: np.ndarray
+) -> tuple[tuple, np.ndarray]:
+    """L U of a front, and the update less what it takes."""
+    getrf = lapack.get_lapack_funcs("getrf", dtype=matrix.dtype)
+    trsm, gemm = blas.get_blas_funcs(("trsm", "gemm"), dtype=matrix.dtype)
+    both, pivots, _ = getrf(matrix, overwrite_a=1)
+    where, swapped = np.flatnonzero(np.diagonal(both) == 0), np.arange(len(both))
+    both[where, where] = np.finfo(matrix.dtype).eps  # singular
+    for i, pivot in enumerate(pivots.tolist()):
+        swapped[i], swapped[pivot] = swapped[pivot], swapped[i]
+    if len(below):
+        below = trsm(1.0, both, below, side=1, overwrite_b=1)
+        beside = np.asfortranarray(beside[:, swapped])
+        beside = trsm(1.0, both, beside, side=1, lower=1, trans_a=1, diag=1, overwrite_b=1)
+        update = gemm(-1.0, below, beside, beta=1.0, c=update, trans_b=1, overwrite_c=1)
+    return (both, below, beside, swapped), update
 
 
 @inlined
@@ -251,12 +302,11 @@ def _add(block, to, r, c):
 
 
 @loop
-def add_columns(starts, rows, blocks, begin, end, place, diagonal, below):
-    """Add the columns begin to end of the matrix to a front."""
+def add_columns(starts, rows, blocks, begin, end, place, front):
+    """Add the columns begin to end of the matrix to the diagonal of a front and what is below."""
+    diagonal, below = front
     for j in range(begin, end):
         c = 6 * place[j]
-        for a in range(6):
-            diagonal[c + a, c + a] += ONE
         for p in range(starts[j], starts[j + 1]):
             r = 6 * place[rows[p]]
             if rows[p] < end:
@@ -266,11 +316,13 @@ def add_columns(starts, rows, blocks, begin, end, place, diagonal, below):
 
 
 @loop
-def add_update(values, bodies, end, place, diagonal, below, update):
-    """Add what an earlier front leaves in the lower triangle of its ``bodies`` to a front."""
+def add_update(values, bodies, end, place, front, first):
+    """Add what an earlier front leaves in the lower triangle of its ``bodies``, from the ``first`` diagonal on, to a
+    front: to its diagonal, what is below, and its own update."""
+    diagonal, below, update = front
     for q in range(len(bodies)):
         c = 6 * place[bodies[q]]
-        for p in range(q, len(bodies)):
+        for p in range(q + first, len(bodies)):
             r, block = 6 * place[bodies[p]], values[6 * p : 6 * p + 6, 6 * q : 6 * q + 6]
             if bodies[p] < end:
                 _add(block, diagonal, r, c)
@@ -287,11 +339,13 @@ def _dissection(
     comm: MPI.Comm, points: Array | None, row: np.ndarray, column: np.ndarray, count: int
 ) -> Dissection:
     """That of the bodies of all ranks, found by the first from the entries of each."""
-    upper = row < column
-    parts = comm.gather((np.zeros((0, 1)) if points is None else points, row[upper], column[upper])) or []
+    low, high = np.minimum(row, column), np.maximum(row, column)
+    known = np.zeros((0, 1)) if points is None else points
+    parts = comm.gather((known, np.unique(np.stack([low, high])[:, low < high], axis=1))) or []
 
     def find() -> Dissection:
-        places, one, other = (np.concatenate(column) for column in zip(*parts))
+        places = np.concatenate([part[0] for part in parts])
+        one, other = np.unique(np.concatenate([part[1] for part in parts], axis=1), axis=1)
         return dissected(places_in(count, one, other) if points is None else places, one, other, comm.size)
 
     return on_first(comm, find)
