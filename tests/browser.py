@@ -66,7 +66,7 @@ class Browser:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
         self("Emulation.setDeviceMetricsOverride", **size)
         self("Page.navigate", url=url)
-        self.value("""new CostEstimate(done => { const look = () => document.readyState === 'complete' ? done(true)
+        self.value("""new Promise(done => { const look = () => document.readyState === 'complete' ? done(true)
             : setTimeout(look, 20); look(); })""")
         self.value("window.MathJax && MathJax.startup ? MathJax.startup.promise.then(() => true) : true")
 

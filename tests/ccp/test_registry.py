@@ -10,20 +10,15 @@ from problems import from_graph, heap
 
 from pctt import ccp
 from pctt.ccp import Limits
-from pctt.options import describe
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "solvers.md"
 
 
 def table():
     """The solvers as a Markdown table."""
-    lines = ["| `-ccp_type` | method | needs | iterations | options and defaults | source |", "|" + "---|" * 6]
+    lines = ["| `-ccp_type` | method | needs | iterations | source |", "|" + "---|" * 5]
     for solver in ccp.SOLVERS.values():
-        options = ", ".join(
-            f"`-{d.name} {str(d.default).lower() if isinstance(d.default, (bool, type(None))) else d.default}`"
-            for d in describe(solver.options, solver.prefix)
-        )
-        cells = [f"`{solver.name}`", solver.help, solver.needs, f"{solver.iterations:,}", options, solver.source]
+        cells = [f"`{solver.name}`", solver.help, solver.needs, f"{solver.iterations:,}", solver.source]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
