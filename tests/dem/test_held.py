@@ -237,9 +237,10 @@ def test_a_wheel_on_hard_ground_needs_no_torque_and_pulls_no_load():
 
 @pytest.mark.slow
 def test_wheels_of_two_sizes_have_the_same_dimensionless_power():
-    """Slonaker et al. (2017): on a bed of the same grains, wheels whose mass, size and spin are scaled together."""
-    one, other = (driven(Wheel(n=n)) for n in (7, 10))
-    assert one["mean_power"] == pytest.approx(other["mean_power"], rel=0.1)
+    """Slonaker et al. (2017): on a bed of the same grains, wheels whose mass, size and spin are scaled together, and
+    whose powers differ by a factor of 3.5. Two packings of one size differ by 15 %."""
+    one, other = (np.mean([driven(Wheel(n=n, seed=seed))["mean_power"] for seed in (1, 2)]) for n in (7, 10))
+    assert one == pytest.approx(other, rel=0.2)
 
 
 def driven(scene):
