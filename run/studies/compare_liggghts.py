@@ -1,6 +1,7 @@
 """The stirred mixer by LIGGGHTS and by `pctt.Simulation`, from the same settled beds on the same core:
 
     run/study compare_liggghts [N ...] [--seconds S,S] [--starts M,M] [--stiffness K,K] [--ours SETTINGS ...]
+    run/study compare_liggghts --cores [N ...] [--seconds S,S]
 
 LIGGGHTS is not part of this project: apt-get install liggghts. It has linear springs and dashpots, kt = 2/7 kn,
 restitution 0.3, and steps of a tenth of the contact time, as its users choose them. SETTINGS of ours are fields of
@@ -19,6 +20,9 @@ The limit of small steps and stiff contacts, from which errors of the torque are
 nothing of each other: LIGGGHTS with its stiffest contacts, and our smallest steps. Its standard error is what the two
 show, or what their starts do, if that is more. Writes results/compare_liggghts.json and .png; without words (8 minutes)
 its section of docs/measurements.md and docs/liggghts.png, too.
+
+With --cores it measures seconds by the clock on one rank and on two, of one start: LIGGGHTS with 1e8 N/m, and our
+defaults. Without more words (10 minutes) it writes a section, too.
 """
 
 from __future__ import annotations
@@ -50,6 +54,7 @@ FORGETS = 0.1  # [s] from the start, not part of means and overlaps
 SAMPLES = 0.025  # [s] between two samples of positions
 MOVED = 1e-5  # [m]
 RESTITUTION = 0.3
+STIFF = 1e8  # of LIGGGHTS on one rank and on two [N/m]
 CONTACT_STEPS = 10  # time steps of LIGGGHTS in a contact
 OURS = ("default", "dt=.015,tol=1e-3")
 LETTERS = string.ascii_lowercase + string.ascii_uppercase  # of the rows, in the figure
@@ -261,15 +266,17 @@ class Spent(NamedTuple):
 
     said: str
     cpu: float
+    seconds: float  #: by the clock
     memory: float
 
 
-def liggghts_run(folder: Path) -> Spent:
+def liggghts_run(folder: Path, ranks: int = 1) -> Spent:
     """Run the input in the folder; LiggghtsError if that fails."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     memory = 0.0
     with (folder / "said").open("w+") as said:
-        command = ["liggghts", "-in", "script", "-log", "none"]
+        command = [str(shared.MPIEXEC), "-n", str(ranks)] if ranks > 1 else []
+        command += ["liggghts", "-in", "script", "-log", "none"]
         process = subprocess.Popen(command, cwd=folder, stdout=said, stderr=subprocess.STDOUT)
         while process.poll() is None:
             memory = max(memory, peak_memory(process.pid))
@@ -279,7 +286,14 @@ def liggghts_run(folder: Path) -> Spent:
     if process.returncode:
         raise LiggghtsError(f"LIGGGHTS failed with code {process.returncode}:\n{text[-1500:]}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return Spent(text, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, memory)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Spent(text, cpu, time.perf_counter() - begun, memory)
+
+
+def put_input(folder: Path, start: Start) -> None:
+    """All files of a run but the script."""
+    for file, text in {**meshes(start), "atoms.data": atoms(start)}.items():
+        (folder / file).write_text(text)
 
 
 def theirs(start: Start, stiffness: float, seconds: float) -> Course:
@@ -287,8 +301,7 @@ def theirs(start: Start, stiffness: float, seconds: float) -> Course:
     dt = contact_law(stiffness, start.mass)["dt"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for file, text in {**meshes(start), "atoms.data": atoms(start)}.items():
-            (folder / file).write_text(text)
+        put_input(folder, start)
         (folder / "script").write_text(script(start, stiffness, 0))
         nothing = liggghts_run(folder)
         (folder / "script").write_text(script(start, stiffness, round(seconds / dt)))
@@ -355,6 +368,52 @@ def compare(n: int, seconds: float, count: int, words: argparse.Namespace) -> li
     print(f"limit {limit:.2f} +- {error:.2f} kN m")
     case = {"n": n, "seconds": seconds, "starts": count, "limit": limit, "limit_error": error}
     return [case | row for row in rows]
+
+
+def on_cores(n: int, seconds: float) -> Row:
+    """Seconds by the clock per simulated second of both codes, on one rank and on two."""
+    start, found = start_of(n, 0), {"n": n, "seconds": seconds}
+    with settled(Mixer(n=n), solver="apgd") as sim:
+        steps = round(seconds / sim.settings.dt)
+    for ranks in (1, 2):
+        spent = []
+        with tempfile.TemporaryDirectory() as name:
+            put_input(folder := Path(name), start)
+            for their_steps in (0, round(seconds / contact_law(STIFF, start.mass)["dt"])):
+                (folder / "script").write_text(script(start, STIFF, their_steps))
+                spent.append(liggghts_run(folder, ranks).seconds)
+        _, lines = shared.settled_steps("mixer", n, steps + 1, "-ccp_type", "apgd", ranks=ranks)
+        found[f"theirs_{ranks}"] = (spent[1] - spent[0]) / seconds
+        ours = sum(line["seconds"] for line in lines[1:])  # the first loads compiled loops
+        found[f"ours_{ranks}"] = ours / (lines[-1]["time"] - lines[0]["time"])
+    found |= {f"{code}_faster": found[f"{code}_1"] / found[f"{code}_2"] for code in ("theirs", "ours")}
+    return found | {f"ratio_{ranks}": found[f"ours_{ranks}"] / found[f"theirs_{ranks}"] for ranks in (1, 2)}
+
+
+def cores(sizes: list[int], seconds: list[float], about: Row) -> list[Row]:
+    """The table of one and two ranks."""
+    names = [f"{name}_{ranks}" for name in ("theirs", "ours", "ratio") for ranks in (1, 2)]
+    faster = {name: (name, "13.2f") for name in ("theirs_faster", "ours_faster")}
+    table = Table(n=("n", "3d"), **{name: (name, "9.3g") for name in names}, **faster)
+    rows: list[Row] = []
+    for n, simulated in zip(sizes, cycle(seconds)):
+        rows.append(on_cores(n, simulated))
+        table.add(rows[-1])
+        shared.record("compare_liggghts_cores", about, rows)
+    return rows
+
+
+def write_cores(rows: list[Row], about: Row) -> None:
+    """The section of docs/measurements.md."""
+    lines = []
+    for row in rows:
+        values = [f"{row[f'{code}_{ranks}']:.3g}" for code in ("theirs", "ours") for ranks in (1, 2)]
+        ratios = [f"{row[name]:.2f}" for name in ("theirs_faster", "ours_faster", "ratio_1", "ratio_2")]
+        lines.append([row["n"], *values, *ratios])
+    heads = ["n", "LIGGGHTS, 1 rank", "2 ranks", "pctt, 1 rank", "2 ranks", "LIGGGHTS, times faster", "pctt",
+             "pctt over LIGGGHTS, 1 rank", "2 ranks"]  # fmt: skip
+    words = {"cpu": about["cpu"], "commit": shared.commit(), "table": shared.markdown(heads, lines)}
+    shared.replace_section(PAGE, HEAD_OF_CORES, TEXT_OF_CORES.format(**words))
 
 
 def draw(sizes: list[list[Row]]) -> None:
@@ -428,26 +487,45 @@ other core is idle, commit {commit}.
 """
 
 
+HEAD_OF_CORES = "## Beside LIGGGHTS on two cores\n"
+TEXT_OF_CORES = """`run/study compare_liggghts --cores` writes this section: seconds by the clock per
+simulated second of the same settled beds, on one rank and on two of an {cpu} of two cores, commit {commit}. LIGGGHTS has
+k = 1e8 N/m; ours are the defaults with `apgd`. n = 32 has 274,626 spheres; of it 0.05 s.
+
+{table}
+
+"""
+
+
 def main() -> None:
     line = shared.parser("compare_liggghts", __doc__)
-    line.add_argument("n", type=int, nargs="*", default=[4, 8, 16], help="sizes of the mixer (4 8 16)")
-    line.add_argument("--seconds", type=shared.listed(float), default="3,3,0.4", help="simulated, of each (3,3,0.4)")
+    line.add_argument("n", type=int, nargs="*", help="sizes of the mixer (4 8 16, with --cores 32 as well)")
+    line.add_argument("--seconds", type=shared.listed(float), help="simulated, of each (3,3,0.4; --cores 1,1,0.2,0.05)")
+    line.add_argument("--cores", action="store_true", help="one rank and two, by the clock")
     line.add_argument("--starts", type=shared.listed(shared.at_least_one), default="2,2,1", help="of each (2,2,1)")
     usual = "1e7,1e8"
     line.add_argument("--stiffness", type=shared.listed(float), default=usual, help=f"of LIGGGHTS [N/m] ({usual})")
     line.add_argument("--ours", nargs="+", default=OURS, help="settings, see above")
     words = line.parse_args()
+    words.n = words.n or ([4, 8, 16, 32] if words.cores else [4, 8, 16])
+    words.seconds = words.seconds or ([1.0, 1.0, 0.2, 0.05] if words.cores else [3.0, 3.0, 0.4])
     try:
         _ = [settings_of(setting) for setting in words.ours]
     except ValueError as error:
         line.error(f"--ours {error}")
-    if not words.seconds or min(words.seconds) <= FORGETS + SAMPLES:
+    if not words.cores and min(words.seconds) <= FORGETS + SAMPLES:
         line.error(f"--seconds {words.seconds}: allowed is more than {FORGETS + SAMPLES}")
     if not shutil.which("liggghts"):
         line.exit(1, "there is no program liggghts on the path; on Debian: apt-get install liggghts\n")
-    shared.keep_to_one_core()
+    if not words.cores:
+        shared.keep_to_one_core()
     about = shared.say_machine()
     try:
+        if words.cores:
+            rows = cores(words.n, words.seconds, about)
+            if sys.argv[1:] == ["--cores"]:
+                write_cores(rows, about)
+            return
         sizes = []
         for n, seconds, starts in zip(words.n, cycle(words.seconds), cycle(words.starts)):
             sizes.append(compare(n, seconds, starts, words))
