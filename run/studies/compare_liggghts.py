@@ -489,8 +489,8 @@ other core is idle, commit {commit}.
 
 HEAD_OF_CORES = "## Beside LIGGGHTS on two cores\n"
 TEXT_OF_CORES = """`run/study compare_liggghts --cores` writes this section: seconds by the clock per
-simulated second of the same settled beds, on one rank and on two of an {cpu} of two cores, commit {commit}. LIGGGHTS has
-k = 1e8 N/m; ours are the defaults with `apgd`. n = 32 has 274,626 spheres; of it 0.05 s.
+simulated second of the same settled beds, on one rank and on two of an {cpu} of two cores, commit {commit}.
+LIGGGHTS has k = 1e8 N/m; ours are the defaults with `apgd`. n = 32 has 274,626 spheres; of it 0.05 s.
 
 {table}
 
