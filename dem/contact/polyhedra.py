@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dem.arrays import Floats, Ints
-from dem.compiled import inlined, loop
+from dem.compiled import inlined, inner, loop
 from dem.contact.narrow import CORNERS, ContactBuffer, Manifold, Planes, Spheres
 from dem.contact.simplex import CLOSE, ROUND, SNAP, nearer, no_simplex
 from dem.geometry.vectors import dot, plus
@@ -139,7 +139,7 @@ def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
     return contacts.manifold(_planes(body.hulls.tables()[0], body.columns(), plane[:], delta, contacts[:]))
 
 
-@loop
+@inner
 def _set(out, k, place, normal, gap):
     (x, y, z), (u, v, w) = place, normal
     out[k, 0], out[k, 1], out[k, 2], out[k, 3], out[k, 4], out[k, 5], out[k, 6] = x, y, z, u, v, w, gap
@@ -197,7 +197,7 @@ def _place(faces, corner, body, m, place, t, both):
     return thick
 
 
-@loop
+@inner
 def _within(points, count, inset, h, turn, m, skin, t, core):
     """Fill in where the vertices of a polyhedron are when its faces move in by the depth of its skin."""
     for k in range(count[h, 0]):
@@ -207,7 +207,7 @@ def _within(points, count, inset, h, turn, m, skin, t, core):
                 core[t, k, n] += skin * turn[m, n, i] * inset[h, k, i]
 
 
-@loop
+@inner
 def _beyond(faces, normals, level, points, many, reach, tie, best, face):
     """The face whose plane is furthest from the points on its outer side, and how far that is, if it is more than
     `best`; else `best` and `face`. Ends early where it is more than the reach."""
@@ -223,7 +223,7 @@ def _beyond(faces, normals, level, points, many, reach, tie, best, face):
     return best, face
 
 
-@loop
+@inner
 def _rounded(both, count, rows, axis, apart):
     """The greatest of the gaps along the normals of faces, each wider by what the normal is off the axis, to the
     second, or off its reverse, of polyhedra that are so far apart without their skins."""
@@ -239,7 +239,7 @@ def _rounded(both, count, rows, axis, apart):
     return best
 
 
-@loop
+@inner
 def _slopes(t, edges, edge, points, faces, normals, out):
     """Fill in the scalar products of the edges of a polyhedron with normals of the other one."""
     for e in range(edges):
@@ -250,7 +250,7 @@ def _slopes(t, edges, edge, points, faces, normals, out):
             out[t, e, f] = x * u + y * v + z * w
 
 
-@loop
+@inner
 def _crossing(both, count, sides, rows, tie, slopes):
     """How far the polyhedra are apart along the common normal of two edges, the furthest, the two edges, and the
     normal: two edges whose normals cross on the sphere make a face of the difference of the two."""
@@ -282,7 +282,7 @@ def _crossing(both, count, sides, rows, tie, slopes):
     return best, (one, two), axis
 
 
-@loop
+@inner
 def _towards(t, count, corner, h, both, axis, sign, slack):
     """The face that looks along the axis, or with `sign` -1 against it, the most among those with most vertices at the
     end of that way, within the slack."""
@@ -359,7 +359,7 @@ def _corners(t, many, others, polygons, thick, most, found, spots, code):
     return found, least
 
 
-@loop
+@inner
 def _inside(beyond, many, thick):
     """Whether a point is beyond none of the lines of a polygon, to a tolerance."""
     inside = True
@@ -393,7 +393,7 @@ def _crossings(many, others, polygons, thick, most, found, spots, code):
     return found, least
 
 
-@loop
+@inner
 def _well_inside(spots, many, corner, opposite, t, line, margin):
     """Whether the middle of places is further than the margin inside the lines of one of two polygons."""
     (h, f), x, y, n, inside = opposite[t], 0.0, 0.0, 0, True
@@ -405,7 +405,7 @@ def _well_inside(spots, many, corner, opposite, t, line, margin):
     return inside
 
 
-@loop
+@inner
 def _overlaid(both, corner, opposite, frame, thick, most, polygons, shared):
     """The corners of the polygon that is common to two faces, seen along the third axis of the frame: how many corners
     of the first, of the second, and crossings have a gap of at most `most`, each with those before it, and the least
@@ -429,7 +429,7 @@ def _overlaid(both, corner, opposite, frame, thick, most, polygons, shared):
     return (of_first, of_both, in_all), min(least, lesser)
 
 
-@loop
+@inner
 def _distance(p, q, apart, reach, size, simplex):
     """How many points of the difference of two polyhedra that do not overlap span what is nearest to the origin, and
     the distance, or that it is more than the reach: zero and inf. Fills in the points, the rows of the vertices of
@@ -459,7 +459,7 @@ def _distance(p, q, apart, reach, size, simplex):
     return count, np.sqrt(square)
 
 
-@loop
+@inner
 def _witness(t, points, simplex, count):
     """The point of a polyhedron that has these shares of vertices."""
     (_, ends, share, _), place = simplex, (0.0, 0.0, 0.0)
@@ -468,7 +468,7 @@ def _witness(t, points, simplex, count):
     return place
 
 
-@loop
+@inner
 def _surface(t, points, simplex, count, core, axis, skin):
     """The place of a polyhedron outside of a place `core` of it without its skin, which has these shares of vertices;
     the vertex of the greatest share, and another one, -1 if there is none. The axis looks from the first, t = 0."""
@@ -487,7 +487,7 @@ def _surface(t, points, simplex, count, core, axis, skin):
     return one, two, _foot(points[t, one], points[t, two if two >= 0 else one], core)
 
 
-@loop
+@inner
 def _foot(a, b, point):
     """The point of the line from a to b that is closest to a point, between the two."""
     u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -497,7 +497,7 @@ def _foot(a, b, point):
     return a[0] + t * u, a[1] + t * v, a[2] + t * w
 
 
-@loop
+@inner
 def _separates(p, q, one, two, distance):
     """Whether polyhedra are apart along the vector between two places, of that length, which may be within both."""
     x, y, z = plus(two, -1.0, one)
@@ -509,7 +509,7 @@ def _separates(p, q, one, two, distance):
     return least - most > 0.5 * distance * distance
 
 
-@loop
+@inner
 def _edge_of(edge, h, many, one, two):
     """The number of the edge between two vertices, -1 if there is none."""
     for e in range(many):
@@ -519,7 +519,7 @@ def _edge_of(edge, h, many, one, two):
     return -1
 
 
-@loop
+@inner
 def _on_edges(t, skins, cores, edge, axis, limits, found, contacts):
     """Add the vertices of a polyhedron, the first or the second (`t` 0 or 1), of those that are foremost towards the
     other one along the axis within the slack, that are at most `most` from edges of that one, which has such vertices
@@ -550,7 +550,7 @@ def _on_edges(t, skins, cores, edge, axis, limits, found, contacts):
     return found, least
 
 
-@loop
+@inner
 def _nearest_edge(point, others, edge, axis, sign, most):
     """Of the edges of a polyhedron, of which no end is further along the axis than `most`, the one nearest to a point:
     its squared distance, the ends, which are the same where the nearest is one of them, and the way to it."""
@@ -570,7 +570,7 @@ def _nearest_edge(point, others, edge, axis, sign, most):
     return best, one, two, way
 
 
-@loop
+@inner
 def _frame(normal, sign, one, other, frame):
     """Fill in a normal as the third axis, and two across it; the way from one point to the other is across it."""
     x, y, z = other[0] - one[0], other[1] - one[1], other[2] - one[2]
@@ -696,7 +696,7 @@ def _lay(vertices, sides, opposite, parts, shared, frame, progress, center, cont
     return parts[2]
 
 
-@loop
+@inner
 def _closest_cores(points, tables, turns, m, rows, between, limits, core, simplex):
     """The distance of the polyhedra without their skins, inf if it is out of reach, zero where they overlap; the
     direction from the first to the second; how many points of the simplex span it, and where it ends on both. Fills in
@@ -713,7 +713,7 @@ def _closest_cores(points, tables, turns, m, rows, between, limits, core, simple
     return gap, way, many, (one, two)
 
 
-@loop
+@inner
 def _near_edges(points, count, edge, rows, closest, gap, limits, simplex, contacts):
     """Add the contacts of this gap of polyhedra that are apart without their skins, if it is within reach: vertices
     near edges, and the closest points if these are closer; the new number of contacts."""
@@ -735,7 +735,7 @@ def _near_edges(points, count, edge, rows, closest, gap, limits, simplex, contac
     return found
 
 
-@loop
+@inner
 def _add_closest(points, tables, rows, closest, skin, simplex, progress, contacts):
     """Add the closest points, or put them in the place of the contact that has their name; the new number."""
     (count, edge), (core_gap, axis, many, (one, two)), (at, found) = tables, closest, progress
@@ -761,7 +761,7 @@ def _midway(a, b):
     return 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])
 
 
-@loop
+@inner
 def _edges_crossed(points, edge, rows, edges, axis, gap, found, contacts):
     """Add the contact of two edges whose common normal is the axis; the new number of contacts."""
     (g, h), (one, two), (_, feature, out) = rows, edges, contacts
@@ -772,7 +772,7 @@ def _edges_crossed(points, edge, rows, edges, axis, gap, found, contacts):
     return found + 1
 
 
-@loop
+@inner
 def _corner_in_face(points, count, rows, own, frame, gap, found, contacts):
     """Add the foremost corner in a face that the faces of the other one, seen from it, are all too steep for; the new
     number of contacts."""
@@ -786,7 +786,7 @@ def _corner_in_face(points, count, rows, own, frame, gap, found, contacts):
     return found + 1
 
 
-@loop
+@inner
 def _complete(m, start, found, center, contacts):
     """Fill in the pair of contacts, and move them there from around its first polyhedron."""
     for k in range(start, found):
@@ -795,7 +795,7 @@ def _complete(m, start, found, center, contacts):
             contacts[2][k, n] += center[m, n]
 
 
-@loop
+@inner
 def _each_once(contacts, start, own, found, close):
     """Leave out the contacts from `own` on that are in the place of one from `start` on; the new number of contacts."""
     (_, feature, out), to = contacts, own
@@ -812,7 +812,7 @@ def _each_once(contacts, start, own, found, close):
     return to
 
 
-@loop
+@inner
 def _between(a, b, c, d):
     """Midway of the points of two edges, from a to b and from c to d, where their lines are closest, or their ends."""
     u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
