@@ -362,10 +362,10 @@ def _corners(t, many, others, polygons, thick, most, found, spots, code):
 @inner
 def _inside(beyond, many, thick):
     """Whether a point is beyond none of the lines of a polygon, to a tolerance."""
-    inside = True
-    for n in range(many):
-        inside &= beyond[n] <= thick
-    return inside
+    n = 0
+    while n < many and beyond[n] <= thick:
+        n += 1
+    return n == many
 
 
 @inlined
@@ -396,13 +396,14 @@ def _crossings(many, others, polygons, thick, most, found, spots, code):
 @inner
 def _well_inside(spots, many, corner, opposite, t, line, margin):
     """Whether the middle of places is further than the margin inside the lines of one of two polygons."""
-    (h, f), x, y, n, inside = opposite[t], 0.0, 0.0, 0, True
+    (h, f), x, y, n = opposite[t], 0.0, 0.0, 0
     for k in range(many):
         x, y = x + spots[k, 0] / many, y + spots[k, 1] / many
     while n < corner.shape[2] and corner[h, f, n] >= 0:
-        inside &= line[t, n, 0] * x + line[t, n, 1] * y - line[t, n, 2] <= -margin
+        if not line[t, n, 0] * x + line[t, n, 1] * y - line[t, n, 2] <= -margin:
+            return False
         n += 1
-    return inside
+    return True
 
 
 @inner
@@ -477,11 +478,8 @@ def _surface(t, points, simplex, count, core, axis, skin):
         if share[k] > most:
             one, most = ends[k, t], share[k]
     for k in range(count):
-        if ends[k, t] != one:
-            two = ends[k, t]
-    for k in range(count):
         if ends[k, t] != one and ends[k, t] != two:
-            three = ends[k, t]
+            two, three = ends[k, t], two
     if three >= 0:
         return one, two, plus(core, skin - 2.0 * t * skin, axis)
     return one, two, _foot(points[t, one], points[t, two if two >= 0 else one], core)
@@ -803,7 +801,9 @@ def _each_once(contacts, start, own, found, close):
         is_new = True
         for n in range(start, own):
             x, y, z = out[k, 0] - out[n, 0], out[k, 1] - out[n, 1], out[k, 2] - out[n, 2]
-            is_new &= x * x + y * y + z * z > close * close
+            if not x * x + y * y + z * z > close * close:
+                is_new = False
+                break
         if is_new:
             feature[to] = feature[k]
             for n in range(7):
