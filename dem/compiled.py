@@ -23,6 +23,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 prange = range  #: in compiled loops that of numba: passes of the loop go to threads, where there are several
 PART = 4096  #: rows of a sum's part: 100 kB of impulses, enough work for a thread
 
+_INNER = {"no_cpython_wrapper": True}
 _threads = 1
 
 
@@ -56,7 +57,7 @@ class Loop:
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]):
         update_wrapper(self, function)
-        self._function, self._options = function, {"error_model": "numpy", **options}
+        self._function, self._options = function, {"error_model": "numpy", "no_cfunc_wrapper": True, **options}
         self._spreads = "prange" in function.__code__.co_names
 
     def __call__(self, *arguments: Any) -> Any:
@@ -80,7 +81,12 @@ class Loop:
 
         if self._spreads:
             function.__globals__["prange"] = numba.prange
-        return cast(Callable[..., Any], numba.njit(**options)(function))
+        compiled = cast(Callable[..., Any], numba.njit(**options)(function))
+        if "no_cpython_wrapper" in options and hasattr(compiled, "py_func"):
+            from dem.machine_code import Inner
+
+            compiled.__class__ = Inner
+        return compiled
 
     def _with_all_reached(self, compiled: Any) -> Any:
         """The same; the compiler knows no loop that it has not made, nor what is compiled anew if it changes."""
@@ -111,7 +117,13 @@ def loop(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """A function that becomes a part of each loop that calls it, at the hands of LLVM: numba's own ``inline`` copies
     its tree of the function at every call, and took half of the seconds of compilation."""
-    return cast(Function, Loop(function, {"forceinline": True}))
+    return cast(Function, Loop(function, {**_INNER, "forceinline": True}))
+
+
+def inner(function: Function) -> Function:
+    """A loop that other loops alone call. It has no door for Python, with a second copy of what is behind it, and is
+    compiled in half the time."""
+    return cast(Function, Loop(function, _INNER))
 
 
 def tell_first_compilation(say: Callable[[str], None]) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numba.core import caching, config, event, types
 from numba.core.dispatcher import Dispatcher
+from numba.core.registry import CPUDispatcher
 
 with suppress(ImportError):  # where there is colorama, numba lets it end every output by an escape sequence
     from colorama import initialise
@@ -47,6 +48,13 @@ class _NoCollection(event.Listener):
 event.register("numba:compile", _NoCollection())
 
 _PLAIN = (int, float, complex, str, bytes, type(None), np.generic, np.dtype, enum.Enum)
+
+
+class Inner(CPUDispatcher):
+    """A function that only compiled code may call; without this Python would call machine code that is not there."""
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.py_func(*arguments)
 
 
 class _Beside(_InTree):

@@ -21,10 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dem.arrays import Floats, Ints
-from dem.compiled import inlined, loop
+from dem.compiled import inlined, inner, loop
 from dem.contact.narrow import CORNERS, ContactBuffer, Manifold, Planes, Spheres
 from dem.contact.simplex import CLOSE, ROUND, SNAP, nearer, no_simplex
-from dem.geometry.vectors import dot
+from dem.geometry.vectors import dot, plus
 from dem.shapes.forms import Form
 from dem.shapes.polyhedra import Faces, Solid, hull
 
@@ -38,6 +38,9 @@ TIE = 1e-9
 
 #: Edges whose angle has a sine below this are parallel and have no normal in common.
 PARALLEL = 1e-5
+
+#: The polyhedra of a pair, of the type of a count: loops would be compiled once more for literal numbers.
+FIRST, SECOND = np.int64(0), np.int64(1)
 
 
 class Hulls(NamedTuple):
@@ -108,33 +111,6 @@ class Polyhedra(NamedTuple):
         return center, turn, scale, self.hull
 
 
-class Edges(NamedTuple):
-    """A polyhedron in the world by its edges, within loops."""
-
-    counts: Ints  #: (3,) of vertices, faces, edges
-    points: Floats  #: (v, 3) its vertices
-    normals: Floats  #: (f, 3)
-    edge: Ints  #: (e, 2)
-    wing: Ints  #: (e, 2)
-
-
-class Cored(NamedTuple):
-    """The same with and without its skin."""
-
-    points: Floats  #: (v, 3)
-    core: Floats  #: (v, 3)
-    edge: Ints  #: (e, 2)
-
-
-class Polygon(NamedTuple):
-    """A face across the axis along which it is seen, within loops."""
-
-    many: int  #: its corners
-    flat: Floats  #: (s, 3) these, the height last
-    beyond: Floats  #: (s, s) how far they are beyond the lines of the other polygon
-    plane: Floats  #: (3,) slopes, and height at the origin
-
-
 def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> Manifold:
     """Contacts of gap at most `delta` (m,) [m]: on faces the corners of a polygon, all with the same normal.
 
@@ -163,8 +139,9 @@ def polyhedra_planes(body: Polyhedra, plane: Planes, delta: Floats) -> Manifold:
     return contacts.manifold(_planes(body.hulls.tables()[0], body.columns(), plane[:], delta, contacts[:]))
 
 
-@loop
-def _set(out, k, x, y, z, u, v, w, gap):
+@inner
+def _set(out, k, place, normal, gap):
+    (x, y, z), (u, v, w) = place, normal
     out[k, 0], out[k, 1], out[k, 2], out[k, 3], out[k, 4], out[k, 5], out[k, 6] = x, y, z, u, v, w, gap
 
 
@@ -195,41 +172,42 @@ def _planes(faces, body, plane, delta, contacts):
     return found
 
 
-@loop
-def _place(hull, place, turn, scale, points, normals, level):
-    """Fill in the vertices, the normals and, along these, the levels of the faces of a polyhedron at a place; its half
-    thickness: how far its faces are from its centre at least."""
-    (count, vertex, normal, corner), (x, y, z) = hull, place
-    for k in range(count[0]):
-        a, b, c = scale[0] * vertex[k, 0], scale[1] * vertex[k, 1], scale[2] * vertex[k, 2]
-        points[k, 0] = x + (turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c)
-        points[k, 1] = y + (turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c)
-        points[k, 2] = z + (turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c)
-    thick = np.inf
-    for i in range(count[1]):
-        a, b, c = normal[i, 0] / scale[0], normal[i, 1] / scale[1], normal[i, 2] / scale[2]
+@inlined
+def _place(faces, corner, body, m, place, t, both):
+    """Fill in the vertices, the normals and, along these, the levels of the faces of a polyhedron, which is the first
+    or the second (`t` 0 or 1) of `both`, at a place; its half thickness: how far its faces are from its centre at
+    least."""
+    (_, count, vertex, normal), (_, turn, scale, hull), (points, normals, level) = faces, body, both
+    (x, y, z), h, thick = place, hull[m], np.inf
+    for k in range(count[h, 0]):
+        a, b, c = scale[m, 0] * vertex[h, k, 0], scale[m, 1] * vertex[h, k, 1], scale[m, 2] * vertex[h, k, 2]
+        points[t, k, 0] = x + (turn[m, 0, 0] * a + turn[m, 0, 1] * b + turn[m, 0, 2] * c)
+        points[t, k, 1] = y + (turn[m, 1, 0] * a + turn[m, 1, 1] * b + turn[m, 1, 2] * c)
+        points[t, k, 2] = z + (turn[m, 2, 0] * a + turn[m, 2, 1] * b + turn[m, 2, 2] * c)
+    for i in range(count[h, 1]):
+        a, b, c = normal[h, i, 0] / scale[m, 0], normal[h, i, 1] / scale[m, 1], normal[h, i, 2] / scale[m, 2]
         per = 1.0 / np.sqrt(a * a + b * b + c * c)
-        u = (turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c) * per
-        v = (turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c) * per
-        w = (turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c) * per
-        k = corner[i, 0]
-        normals[i, 0], normals[i, 1], normals[i, 2] = u, v, w
-        level[i] = u * points[k, 0] + v * points[k, 1] + w * points[k, 2]
-        thick = min(thick, level[i] - (u * x + v * y + w * z))
+        u = (turn[m, 0, 0] * a + turn[m, 0, 1] * b + turn[m, 0, 2] * c) * per
+        v = (turn[m, 1, 0] * a + turn[m, 1, 1] * b + turn[m, 1, 2] * c) * per
+        w = (turn[m, 2, 0] * a + turn[m, 2, 1] * b + turn[m, 2, 2] * c) * per
+        k = corner[h, i, 0]
+        normals[t, i, 0], normals[t, i, 1], normals[t, i, 2] = u, v, w
+        level[t, i] = u * points[t, k, 0] + v * points[t, k, 1] + w * points[t, k, 2]
+        thick = min(thick, level[t, i] - (u * x + v * y + w * z))
     return thick
 
 
-@loop
-def _within(points, inset, turn, skin, core):
+@inner
+def _within(points, count, inset, h, turn, m, skin, t, core):
     """Fill in where the vertices of a polyhedron are when its faces move in by the depth of its skin."""
-    for k in range(len(core)):
+    for k in range(count[h, 0]):
         for n in range(3):
-            core[k, n] = points[k, n]
+            core[t, k, n] = points[t, k, n]
             for i in range(3):
-                core[k, n] += skin * turn[n, i] * inset[k, i]
+                core[t, k, n] += skin * turn[m, n, i] * inset[h, k, i]
 
 
-@loop
+@inner
 def _beyond(faces, normals, level, points, many, reach, tie, best, face):
     """The face whose plane is furthest from the points on its outer side, and how far that is, if it is more than
     `best`; else `best` and `face`. Ends early where it is more than the reach."""
@@ -245,49 +223,51 @@ def _beyond(faces, normals, level, points, many, reach, tie, best, face):
     return best, face
 
 
-@loop
-def _rounded(faces, normals, level, points, many, axis, sign, apart):
-    """The greatest of the gaps along the normals of faces, each wider by what the normal is off the axis (`sign` -1:
-    off its reverse) of polyhedra that are so far apart without their skins."""
-    best = -np.inf
-    for f in range(faces):
-        u, v, w = normals[f, 0], normals[f, 1], normals[f, 2]
-        least = np.inf
-        for k in range(many):
-            least = min(least, u * points[k, 0] + v * points[k, 1] + w * points[k, 2])
-        off = 1.0 - sign * (u * axis[0] + v * axis[1] + w * axis[2])
-        best = max(best, least - level[f] + apart * off)
+@inner
+def _rounded(both, count, rows, axis, apart):
+    """The greatest of the gaps along the normals of faces, each wider by what the normal is off the axis, to the
+    second, or off its reverse, of polyhedra that are so far apart without their skins."""
+    (points, normals, level), best = both, -np.inf
+    for t in range(2):
+        for f in range(count[rows[t], 1]):
+            u, v, w = normals[t, f, 0], normals[t, f, 1], normals[t, f, 2]
+            least = np.inf
+            for k in range(count[rows[1 - t], 0]):
+                least = min(least, u * points[1 - t, k, 0] + v * points[1 - t, k, 1] + w * points[1 - t, k, 2])
+            off = 1.0 - (1.0 - 2.0 * t) * (u * axis[0] + v * axis[1] + w * axis[2])
+            best = max(best, least - level[t, f] + apart * off)
     return best
 
 
-@loop
-def _slopes(edges, edge, points, faces, normals, out):
-    """Fill in the scalar products of the edges with normals of the other polyhedron."""
+@inner
+def _slopes(t, edges, edge, points, faces, normals, out):
+    """Fill in the scalar products of the edges of a polyhedron with normals of the other one."""
     for e in range(edges):
         a, b = edge[e, 0], edge[e, 1]
-        x, y, z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        x, y, z = plus(points[t, b], -1.0, points[t, a])
         for f in range(faces):
-            out[e, f] = x * normals[f, 0] + y * normals[f, 1] + z * normals[f, 2]
+            u, v, w = normals[1 - t, f, 0], normals[1 - t, f, 1], normals[1 - t, f, 2]
+            out[t, e, f] = x * u + y * v + z * w
 
 
-@loop
-def _crossing(first, second, slopes, tie, axis):
-    """The two edges along whose common normal the polyhedra are furthest apart, and how far: two edges whose normals
-    cross on the sphere make a face of the difference of the two. Fills in the normal, the axis."""
-    (many, p, p_normal, edge, wing), (others, q, q_normal, other_edge, other_wing) = first, second
-    p_slope, q_slope = slopes[0], slopes[1]
-    _slopes(many[2], edge, p, others[1], q_normal, p_slope)
-    _slopes(others[2], other_edge, q, many[1], p_normal, q_slope)
-    best, one, two = -np.inf, -1, -1
-    for e in range(many[2]):
-        left, right = wing[e, 0], wing[e, 1]
-        a, b = edge[e, 0], edge[e, 1]
-        x, y, z = p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
+@inner
+def _crossing(both, count, sides, rows, tie, slopes):
+    """How far the polyhedra are apart along the common normal of two edges, the furthest, the two edges, and the
+    normal: two edges whose normals cross on the sphere make a face of the difference of the two."""
+    (points, normals, _), (_, _, edge, wing), (g, h) = both, sides, rows
+    p, q, p_normal, own, others = points[0], points[1], normals[0], edge[g], edge[h]
+    _slopes(FIRST, count[g, 2], own, points, count[h, 1], normals, slopes)
+    _slopes(SECOND, count[h, 2], others, points, count[g, 1], normals, slopes)
+    best, one, two, axis = -np.inf, -1, -1, (0.0, 0.0, 0.0)
+    for e in range(count[g, 2]):
+        left, right = wing[g, e, 0], wing[g, e, 1]
+        a, b = own[e, 0], own[e, 1]
+        x, y, z = plus(p[b], -1.0, p[a])
         square = x * x + y * y + z * z
-        for d in range(others[2]):
-            s, t = p_slope[e, other_wing[d, 0]], q_slope[d, right]
-            if s * p_slope[e, other_wing[d, 1]] < 0.0 and q_slope[d, left] * t < 0.0 and s * t < 0.0:
-                c, k = other_edge[d, 0], other_edge[d, 1]
+        for d in range(count[h, 2]):
+            s, t = slopes[0, e, wing[h, d, 0]], slopes[1, d, right]
+            if s * slopes[0, e, wing[h, d, 1]] < 0.0 and slopes[1, d, left] * t < 0.0 and s * t < 0.0:
+                c, k = others[d, 0], others[d, 1]
                 i, j, k = q[k, 0] - q[c, 0], q[k, 1] - q[c, 1], q[k, 2] - q[c, 2]
                 u, v, w = y * k - z * j, z * i - x * k, x * j - y * i
                 sine = np.sqrt(u * u + v * v + w * w)
@@ -298,79 +278,77 @@ def _crossing(first, second, slopes, tie, axis):
                 u, v, w = u * per, v * per, w * per
                 apart = u * (q[c, 0] - p[a, 0]) + v * (q[c, 1] - p[a, 1]) + w * (q[c, 2] - p[a, 2])
                 if apart > best + tie:
-                    best, one, two = apart, e, d
-                    axis[0], axis[1], axis[2] = u, v, w
-    return best, one, two
+                    best, one, two, axis = apart, e, d, (u, v, w)
+    return best, (one, two), axis
 
 
-@loop
-def _towards(many, corner, points, normals, axis, sign, slack):
+@inner
+def _towards(t, count, corner, h, both, axis, sign, slack):
     """The face that looks along the axis, or with `sign` -1 against it, the most among those with most vertices at the
     end of that way, within the slack."""
-    far = -np.inf
-    for k in range(many[0]):
-        far = max(far, sign * dot(axis, points[k]))
+    points, normals, far = both[0], both[1], -np.inf
+    for k in range(count[h, 0]):
+        far = max(far, sign * dot(axis, points[t, k]))
     best, most, face = -np.inf, 0, 0
-    for f in range(many[1]):
+    for f in range(count[h, 1]):
         foremost = 0
-        for s in range(corner.shape[1]):
-            if corner[f, s] < 0:
+        for s in range(corner.shape[2]):
+            if corner[h, f, s] < 0:
                 break
-            foremost += sign * dot(axis, points[corner[f, s]]) >= far - slack
-        ahead = sign * dot(axis, normals[f])
+            foremost += sign * dot(axis, points[t, corner[h, f, s]]) >= far - slack
+        ahead = sign * dot(axis, normals[t, f])
         if foremost > most or (foremost == most and ahead > best + TIE):
             best, most, face = ahead, foremost, f
     return face
 
 
 @inlined
-def _polygon(corner, points, normal, frame, sign, flat, line, plane):
+def _polygon(t, corner, points, normal, frame, polygons):
     """Fill in the corners of a face in a frame (rows of unit vectors): two coordinates, and the height along the third
     axis; the lines of its sides, outward normal and level; and its plane, slopes and height at the origin. The number
-    of corners, zero where the frame sees the face from its side. `sign` is -1 where the corners turn to the right."""
-    many = 0
+    of corners, zero where the frame sees the face from its side. Of the second, t = 1, they turn to the right."""
+    (flat, line, plane, _), sign, many = polygons, 1.0 - 2.0 * t, 0
     while many < len(corner) and corner[many] >= 0:
         k = corner[many]
         for n in range(3):
-            flat[many, n] = dot(frame[n], points[k])
+            flat[t, many, n] = dot(frame[n], points[k])
         many += 1
     for k in range(many):
         after = k + 1 if k + 1 < many else 0
-        x, y = flat[after, 0] - flat[k, 0], flat[after, 1] - flat[k, 1]
+        x, y = flat[t, after, 0] - flat[t, k, 0], flat[t, after, 1] - flat[t, k, 1]
         per = sign / max(np.sqrt(x * x + y * y), 1e-300)
-        line[k, 0], line[k, 1] = y * per, -x * per
-        line[k, 2] = line[k, 0] * flat[k, 0] + line[k, 1] * flat[k, 1]
+        line[t, k, 0], line[t, k, 1] = y * per, -x * per
+        line[t, k, 2] = line[t, k, 0] * flat[t, k, 0] + line[t, k, 1] * flat[t, k, 1]
     u, v, w = dot(frame[0], normal), dot(frame[1], normal), dot(frame[2], normal)
     if abs(w) < PARALLEL:
         return 0
-    plane[0], plane[1] = -u / w, -v / w
-    plane[2] = flat[0, 2] - plane[0] * flat[0, 0] - plane[1] * flat[0, 1]
+    plane[t, 0], plane[t, 1] = -u / w, -v / w
+    plane[t, 2] = flat[t, 0, 2] - plane[t, 0] * flat[t, 0, 0] - plane[t, 1] * flat[t, 0, 1]
     return many
 
 
 @inlined
-def _corners(polygon, opposite, sign, thick, most, spots, code):
-    """Fill in the places, the gaps and the numbers of the corners of a polygon that are over another one, if the gap is
-    at most `most`; how many, and the least gap of all. A corner on a corner is one contact, in the middle of the two,
-    and one of the first polygon, `sign` 1."""
-    (many, flat, beyond, plane), (others, other, other_beyond, other_plane) = polygon, opposite
-    found, least = 0, np.inf
+def _corners(t, many, others, polygons, thick, most, found, spots, code):
+    """Add the places, the gaps and the numbers of the corners of one of two polygons that are over the other one, if
+    the gap is at most `most`; how many there are then, and the least gap of all. A corner on a corner is one contact,
+    in the middle of the two, and one of the first polygon, t = 0."""
+    (flat, _, plane, beyond), sign, least = polygons, 1.0 - 2.0 * t, np.inf
     for k in range(many):
-        if not _inside(beyond[k], others, thick):
+        if not _inside(beyond[t, k], others, thick):
             continue
-        x, y = flat[k, 0], flat[k, 1]
-        low, high = flat[k, 2], other_plane[0] * x + other_plane[1] * y + other_plane[2]
+        x, y = flat[t, k, 0], flat[t, k, 1]
+        low, high = flat[t, k, 2], plane[1 - t, 0] * x + plane[1 - t, 1] * y + plane[1 - t, 2]
         twin = -1
         for n in range(others):
-            u, v = other[n, 0] - x, other[n, 1] - y
-            if u * u + v * v <= 4.0 * thick * thick and _inside(other_beyond[n], many, thick):
+            u, v = flat[1 - t, n, 0] - x, flat[1 - t, n, 1] - y
+            if u * u + v * v <= 4.0 * thick * thick and _inside(beyond[1 - t, n], many, thick):
                 twin = n
                 break
         if twin >= 0:
-            if sign < 0.0:
+            if t == 1:
                 continue
-            u, v = other[twin, 0], other[twin, 1]
-            low, high = 0.5 * (low + plane[0] * u + plane[1] * v + plane[2]), 0.5 * (high + other[twin, 2])
+            u, v = flat[1, twin, 0], flat[1, twin, 1]
+            low, high = 0.5 * (low + plane[0, 0] * u + plane[0, 1] * v + plane[0, 2]), 0.5 * (high + flat[1, twin, 2])
             x, y = 0.5 * (x + u), 0.5 * (y + v)
         gap = sign * (high - low)
         least = min(least, gap)
@@ -381,82 +359,83 @@ def _corners(polygon, opposite, sign, thick, most, spots, code):
     return found, least
 
 
-@loop
+@inner
 def _inside(beyond, many, thick):
     """Whether a point is beyond none of the lines of a polygon, to a tolerance."""
-    inside = True
-    for n in range(many):
-        inside &= beyond[n] <= thick
-    return inside
+    n = 0
+    while n < many and beyond[n] <= thick:
+        n += 1
+    return n == many
 
 
 @inlined
-def _crossings(polygon, opposite, thick, most, spots, code):
+def _crossings(many, others, polygons, thick, most, found, spots, code):
     """The same of the crossings of the sides of two polygons, which have the numbers k S + n of two sides, for S in a
     row: the ends of each are on both sides of the other, none of them just on it."""
-    (many, flat, beyond, _), (others, other, other_beyond, _) = polygon, opposite
-    found, least = 0, np.inf
+    (flat, _, _, beyond), least = polygons, np.inf
     for k in range(many):
         after = k + 1 if k + 1 < many else 0
         for n in range(others):
             then = n + 1 if n + 1 < others else 0
-            i, j, s, t = beyond[k, n], beyond[after, n], other_beyond[n, k], other_beyond[then, k]
+            i, j, s, t = beyond[0, k, n], beyond[0, after, n], beyond[1, n, k], beyond[1, then, k]
             if i * j >= 0.0 or s * t >= 0.0 or min(min(abs(i), abs(j)), min(abs(s), abs(t))) <= thick:
                 continue
             i, s = i / (i - j), s / (s - t)
-            low = flat[k, 2] + i * (flat[after, 2] - flat[k, 2])
-            high = other[n, 2] + s * (other[then, 2] - other[n, 2])
+            low = flat[0, k, 2] + i * (flat[0, after, 2] - flat[0, k, 2])
+            high = flat[1, n, 2] + s * (flat[1, then, 2] - flat[1, n, 2])
             least = min(least, high - low)
             if high - low <= most:
-                spots[found, 0] = flat[k, 0] + i * (flat[after, 0] - flat[k, 0])
-                spots[found, 1] = flat[k, 1] + i * (flat[after, 1] - flat[k, 1])
-                spots[found, 2], spots[found, 3], code[found] = 0.5 * (low + high), high - low, k * len(beyond) + n
+                spots[found, 0] = flat[0, k, 0] + i * (flat[0, after, 0] - flat[0, k, 0])
+                spots[found, 1] = flat[0, k, 1] + i * (flat[0, after, 1] - flat[0, k, 1])
+                spots[found, 2], spots[found, 3] = 0.5 * (low + high), high - low
+                code[found] = k * beyond.shape[2] + n
                 found += 1
     return found, least
 
 
-@loop
-def _well_inside(spots, many, corner, line, margin):
-    """Whether the middle of places is further than the margin inside the lines of a polygon."""
-    x, y, n, inside = 0.0, 0.0, 0, True
+@inner
+def _well_inside(spots, many, corner, opposite, t, line, margin):
+    """Whether the middle of places is further than the margin inside the lines of one of two polygons."""
+    (h, f), x, y, n = opposite[t], 0.0, 0.0, 0
     for k in range(many):
         x, y = x + spots[k, 0] / many, y + spots[k, 1] / many
-    while n < len(corner) and corner[n] >= 0:
-        inside &= line[n, 0] * x + line[n, 1] * y - line[n, 2] <= -margin
+    while n < corner.shape[2] and corner[h, f, n] >= 0:
+        if not line[t, n, 0] * x + line[t, n, 1] * y - line[t, n, 2] <= -margin:
+            return False
         n += 1
-    return inside
+    return True
 
 
-@loop
-def _overlaid(face, other, frame, thick, most, room, found):
-    """The corners of the polygon that is common to two faces, each given by its corners, the points and its normal, and
-    seen along the third axis of the frame: how many corners of the first, of the second, and crossings have a gap of at
-    most `most`, and the least gap of all; fills in these and leaves their numbers in `code`."""
-    (flat, line, plane, beyond), (spots, code) = room, found
-    (corners, p, normal), (other_corners, q, other_normal) = face, other
-    many = _polygon(corners, p, normal, frame, 1.0, flat[0], line[0], plane[0])
-    others = _polygon(other_corners, q, other_normal, frame, -1.0, flat[1], line[1], plane[1])
-    if many == 0 or others == 0:
-        return 0, 0, 0, np.inf
+@inner
+def _overlaid(both, corner, opposite, frame, thick, most, polygons, shared):
+    """The corners of the polygon that is common to two faces, seen along the third axis of the frame: how many corners
+    of the first, of the second, and crossings have a gap of at most `most`, each with those before it, and the least
+    gap of all; fills in these and leaves their numbers in `code`."""
+    (points, normals, _), (flat, line, _, beyond), (spots, code), many, others = both, polygons, shared, FIRST, FIRST
+    for t in range(2):
+        h, f = opposite[t]
+        many, others = others, _polygon(t, corner[h, f], points[t], normals[t, f], frame, polygons)
+        if others == 0:
+            return (0, 0, 0), np.inf
     for k in range(many):
         for n in range(others):
             beyond[0, k, n] = line[1, n, 0] * flat[0, k, 0] + line[1, n, 1] * flat[0, k, 1] - line[1, n, 2]
             beyond[1, n, k] = line[0, k, 0] * flat[1, n, 0] + line[0, k, 1] * flat[1, n, 1] - line[0, k, 2]
-    polygon = Polygon(many, flat[0], beyond[0], plane[0])
-    opposite = Polygon(others, flat[1], beyond[1], plane[1])
-    of_first, least = _corners(polygon, opposite, 1.0, thick, most, spots, code)
-    of_second, lesser = _corners(opposite, polygon, -1.0, thick, most, spots[of_first:], code[of_first:])
-    both = of_first + of_second
-    crossed, lowest = _crossings(polygon, opposite, thick, most, spots[both:], code[both:])
-    return of_first, of_second, crossed, min(least, min(lesser, lowest))
+    of_first, of_both, least = FIRST, FIRST, np.inf
+    for t in range(2):
+        of_first = of_both
+        of_both, lesser = _corners(t, many, others, polygons, thick, most, of_both, spots, code)
+        least, many, others = min(least, lesser), others, many
+    in_all, lesser = _crossings(many, others, polygons, thick, most, of_both, spots, code)
+    return (of_first, of_both, in_all), min(least, lesser)
 
 
-@loop
+@inner
 def _distance(p, q, apart, reach, size, simplex):
     """How many points of the difference of two polyhedra that do not overlap span what is nearest to the origin, and
     the distance, or that it is more than the reach: zero and inf. Fills in the points, the rows of the vertices of
     both, and the shares of the points. `apart`: a vector from about the first to about the second."""
-    (x, y, z), (point, ends, _, _), count, square = apart, simplex, 0, np.inf
+    (x, y, z), (point, ends, _, _), count, square = apart, simplex, np.int64(0), np.inf
     for _ in range(64):
         least, most, i, j = np.inf, -np.inf, 0, 0
         for k in range(len(p)):
@@ -481,51 +460,45 @@ def _distance(p, q, apart, reach, size, simplex):
     return count, np.sqrt(square)
 
 
-@loop
-def _witness(points, ends, share, count, place):
-    """Fill in the point of a polyhedron that has these shares of vertices."""
-    place[0], place[1], place[2] = 0.0, 0.0, 0.0
+@inner
+def _witness(t, points, simplex, count):
+    """The point of a polyhedron that has these shares of vertices."""
+    (_, ends, share, _), place = simplex, (0.0, 0.0, 0.0)
     for k in range(count):
-        for n in range(3):
-            place[n] += share[k] * points[ends[k], n]
+        place = plus(place, share[k], points[t, ends[k, t]])
+    return place
 
 
-@loop
-def _surface(points, ends, share, count, core, axis, skin, place):
-    """Fill in the place of a polyhedron outside of a place `core` of it without its skin, which has these shares of
-    vertices; the vertex of the greatest share, and another one, -1 if there is none. The axis looks outward."""
-    one, two, three, most = -1, -1, -1, 0.0
+@inner
+def _surface(t, points, simplex, count, core, axis, skin):
+    """The place of a polyhedron outside of a place `core` of it without its skin, which has these shares of vertices;
+    the vertex of the greatest share, and another one, -1 if there is none. The axis looks from the first, t = 0."""
+    (_, ends, share, _), one, two, three, most = simplex, -1, -1, -1, 0.0
     for k in range(count):
         if share[k] > most:
-            one, most = ends[k], share[k]
+            one, most = ends[k, t], share[k]
     for k in range(count):
-        if ends[k] != one:
-            two = ends[k]
-    for k in range(count):
-        if ends[k] != one and ends[k] != two:
-            three = ends[k]
+        if ends[k, t] != one and ends[k, t] != two:
+            two, three = ends[k, t], two
     if three >= 0:
-        for n in range(3):
-            place[n] = core[n] + skin * axis[n]
-    else:
-        _foot(points[one], points[two if two >= 0 else one], core, place)
-    return one, two
+        return one, two, plus(core, skin - 2.0 * t * skin, axis)
+    return one, two, _foot(points[t, one], points[t, two if two >= 0 else one], core)
 
 
-@loop
-def _foot(a, b, point, place):
-    """Fill in the point of the line from a to b that is closest to a point, between the two."""
+@inner
+def _foot(a, b, point):
+    """The point of the line from a to b that is closest to a point, between the two."""
     u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     square = u * u + v * v + w * w
     t = (point[0] - a[0]) * u + (point[1] - a[1]) * v + (point[2] - a[2]) * w
     t = min(max(t / square, 0.0), 1.0) if square > 0.0 else 0.0
-    place[0], place[1], place[2] = a[0] + t * u, a[1] + t * v, a[2] + t * w
+    return a[0] + t * u, a[1] + t * v, a[2] + t * w
 
 
-@loop
-def _separates(p, q, place, distance):
+@inner
+def _separates(p, q, one, two, distance):
     """Whether polyhedra are apart along the vector between two places, of that length, which may be within both."""
-    x, y, z = place[1, 0] - place[0, 0], place[1, 1] - place[0, 1], place[1, 2] - place[0, 2]
+    x, y, z = plus(two, -1.0, one)
     most, least = -np.inf, np.inf
     for k in range(len(p)):
         most = max(most, x * p[k, 0] + y * p[k, 1] + z * p[k, 2])
@@ -534,25 +507,24 @@ def _separates(p, q, place, distance):
     return least - most > 0.5 * distance * distance
 
 
-@loop
-def _edge_of(edge, one, two):
+@inner
+def _edge_of(edge, h, many, one, two):
     """The number of the edge between two vertices, -1 if there is none."""
-    for e in range(len(edge)):
-        if (edge[e, 0] == one and edge[e, 1] == two) or (edge[e, 0] == two and edge[e, 1] == one):
+    for e in range(many):
+        a, b = edge[h, e, 0], edge[h, e, 1]
+        if (a == one and b == two) or (a == two and b == one):
             return e
     return -1
 
 
-@loop
-def _on_edges(body, other, axis, sign, limits, first, found, contacts):
-    """Add the vertices of a polyhedron, of those that are foremost along the axis (`sign` -1: against it) within the
-    slack, that are at most `most` from edges of the other one, which has such vertices too, and not beside their ends
-    by more than `end`; the new number of contacts, and the least distance. Distances are those of the cores, places
-    those of the vertices and edges outside. `limits` are slack, `most` and `end`; `first` is the number of the first
-    vertex among the features."""
-    (slack, most, end), (_, feature, out), skin, other_skin = limits, contacts, body.points, other.points
-    points, others, edge = body.core, other.core, other.edge
-    front, back, least = -np.inf, np.inf, np.inf
+@inner
+def _on_edges(t, skins, cores, edge, axis, limits, found, contacts):
+    """Add the vertices of a polyhedron, the first or the second (`t` 0 or 1), of those that are foremost towards the
+    other one along the axis within the slack, that are at most `most` from edges of that one, which has such vertices
+    too, and not beside their ends by more than `end`; the new number of contacts, and the least distance. Distances are
+    those of the cores, places those of the vertices and edges outside. `limits` are slack, `most` and `end`."""
+    (slack, most, end), (_, feature, out), sign = limits, contacts, 1.0 - 2.0 * t
+    (points, others), front, back, least = cores, -np.inf, np.inf, np.inf
     for k in range(len(points)):
         front = max(front, sign * dot(axis, points[k]))
     for k in range(len(others)):
@@ -560,38 +532,43 @@ def _on_edges(body, other, axis, sign, limits, first, found, contacts):
     for k in range(len(points)):
         if sign * dot(axis, points[k]) < front - slack:
             continue
-        best, x, y, z, one, two = np.inf, 0.0, 0.0, 0.0, 0, 0
-        for e in range(len(edge)):
-            a, b = edge[e, 0], edge[e, 1]
-            if min(sign * dot(axis, others[a]), sign * dot(axis, others[b])) > back + slack:
-                continue
-            u, v, w = others[b, 0] - others[a, 0], others[b, 1] - others[a, 1], others[b, 2] - others[a, 2]
-            i, j, s = points[k, 0] - others[a, 0], points[k, 1] - others[a, 1], points[k, 2] - others[a, 2]
-            t = min(max((i * u + j * v + s * w) / (u * u + v * v + w * w), 0.0), 1.0)
-            i, j, s = t * u - i, t * v - j, t * w - s
-            square = i * i + j * j + s * s
-            if square < best:
-                best, x, y, z = square, i, j, s
-                one, two = b if t == 1.0 else a, a if t == 0.0 else b
+        best, one, two, way = _nearest_edge(points[k], others, edge, axis, sign, back + slack)
         gap = np.sqrt(best)
         if one == two:  # on a corner, along the axis, or beside it
-            ahead = axis[0] * x + axis[1] * y + axis[2] * z
+            ahead = dot(axis, way)
             if best - ahead * ahead > end * end:
                 continue
-            gap, x, y, z = abs(ahead), ahead * axis[0], ahead * axis[1], ahead * axis[2]
+            gap, way = abs(ahead), (ahead * axis[0], ahead * axis[1], ahead * axis[2])
         if gap <= most:
-            least = min(least, gap)
-            per = sign / gap
-            _set(out, found, 0.0, 0.0, 0.0, x * per, y * per, z * per, gap)
-            _foot(other_skin[one], other_skin[two], skin[k], out[found])
-            for n in range(3):
-                out[found, n] = 0.5 * (out[found, n] + skin[k, n])
-            feature[found] = first + k
+            least, per, tip = min(least, gap), sign / gap, skins[t, k]
+            place = _midway(_foot(skins[1 - t, one], skins[1 - t, two], tip), tip)
+            _set(out, found, place, (way[0] * per, way[1] * per, way[2] * per), gap)
+            feature[found] = t * skins.shape[1] + k
             found += 1
     return found, least
 
 
-@loop
+@inner
+def _nearest_edge(point, others, edge, axis, sign, most):
+    """Of the edges of a polyhedron, of which no end is further along the axis than `most`, the one nearest to a point:
+    its squared distance, the ends, which are the same where the nearest is one of them, and the way to it."""
+    best, one, two, way = np.inf, 0, 0, (0.0, 0.0, 0.0)
+    for e in range(len(edge)):
+        a, b = edge[e, 0], edge[e, 1]
+        if min(sign * dot(axis, others[a]), sign * dot(axis, others[b])) > most:
+            continue
+        u, v, w = plus(others[b], -1.0, others[a])
+        i, j, s = plus(point, -1.0, others[a])
+        t = min(max((i * u + j * v + s * w) / (u * u + v * v + w * w), 0.0), 1.0)
+        i, j, s = t * u - i, t * v - j, t * w - s
+        square = i * i + j * j + s * s
+        if square < best:
+            best, way = square, (i, j, s)
+            one, two = b if t == 1.0 else a, a if t == 0.0 else b
+    return best, one, two, way
+
+
+@inner
 def _frame(normal, sign, one, other, frame):
     """Fill in a normal as the third axis, and two across it; the way from one point to the other is across it."""
     x, y, z = other[0] - one[0], other[1] - one[1], other[2] - one[2]
@@ -603,191 +580,241 @@ def _frame(normal, sign, one, other, frame):
     frame[2, 0], frame[2, 1], frame[2, 2] = u, v, w
 
 
+@inlined
+def _room(faces, sides):
+    """Room for a pair, the first and the second polyhedron in a row: vertices, normals and levels of their faces;
+    vertices without their skins; slopes of edges; a frame, the polygons of two faces, what these share; a simplex."""
+    v, f, s, e = faces[2].shape[1], faces[3].shape[1], sides[0].shape[2], sides[2].shape[1]
+    both, core = (np.empty((2, v, 3)), np.empty((2, f, 3)), np.empty((2, f))), np.empty((2, v, 3))
+    polygons = np.empty((2, s, 3)), np.empty((2, s, 3)), np.empty((2, 3)), np.empty((2, s, s))
+    shared = np.empty((4 * s, 4)), np.empty(4 * s, np.int64)
+    return both, core, np.empty((2, e, f)), np.empty((3, 3)), polygons, shared, no_simplex()
+
+
 @loop
 def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
     """Add to the first contacts those of the pairs that are not done, as long as there is room for the `most` that a
     pair has; new numbers of pairs done and contacts found."""
-    (sharp, count, vertex, normal), (corner, side, edge, wing) = faces, sides
-    (center, turn, scale, hull), (other_center, other_turn, other_scale, other_hull) = first, second
-    (done, found), (pair, feature, out) = progress, contacts
-    most_v, most_f, s, most_e = vertex.shape[1], normal.shape[1], corner.shape[2], edge.shape[1]
-    points, normals, level = np.empty((2, most_v, 3)), np.empty((2, most_f, 3)), np.empty((2, most_f))
-    core, contacts_of_faces = np.empty((2, most_v, 3)), (np.empty((4 * s, 4)), np.empty(4 * s, np.int64))
-    slopes, axis, frame, place = np.empty((2, most_e, most_f)), np.empty(3), np.empty((3, 3)), np.empty((2, 3))
-    polygons = np.empty((2, s, 3)), np.empty((2, s, 3)), np.empty((2, 3)), np.empty((2, s, s))
-    (_, line, _, _), (spots, code), simplex, core_place = polygons, contacts_of_faces, no_simplex(), np.empty((2, 3))
-    p, q, p_normal, q_normal, p_level, q_level = points[0], points[1], normals[0], normals[1], level[0], level[1]
-    for m in range(done, len(hull)):
-        if found + most > len(out):
+    (sharp, count, _, _), (corner, _, edge, _), (done, found), turns = faces, sides, progress, (first[1], second[1])
+    both, core, slopes, frame, polygons, shared, simplex = _room(faces, sides)
+    for m in range(done, len(delta)):
+        if found + most > len(contacts[2]):
             return m, found
-        g, h, reach, start = hull[m], other_hull[m], delta[m], found
-        a, b, c = center[m, 0], center[m, 1], center[m, 2]
-        between = other_center[m, 0] - a, other_center[m, 1] - b, other_center[m, 2] - c
-        many, others = count[g], count[h]
-        own, opposite = (many, vertex[g], normal[g], corner[g]), (others, vertex[h], normal[h], corner[h])
+        rows, between, reach = (first[3][m], second[3][m]), plus(second[0][m], -1.0, first[0][m]), delta[m]
         size = min(
-            _place(own, (0.0, 0.0, 0.0), turn[m], scale[m], p, p_normal, p_level),
-            _place(opposite, between, other_turn[m], other_scale[m], q, q_normal, q_level),
+            _place(faces, corner, first, m, (0.0, 0.0, 0.0), FIRST, both),
+            _place(faces, corner, second, m, between, SECOND, both),
         )
-        tie, tolerance = TIE * size, FLUSH * reach + 2.0 * SNAP * size
-        flush, one = _beyond(many[1], p_normal, p_level, q, others[0], reach, tie, -np.inf, -1)
+        tie, tolerance, skin = TIE * size, FLUSH * reach + 2.0 * SNAP * size, ROUND * size
+        more, start, laid = skin * (sharp[rows[0]] + sharp[rows[1]]), found, 0
+        flush, by = _parting_face(both, count, rows, reach, tie)
         if flush > reach:
             continue
-        flush, other = _beyond(others[1], q_normal, q_level, p, many[0], reach, tie, flush, -1)
-        if flush > reach:
-            continue
-
-        # Where faces part the two, the edges matter only if no face is clearly the nearest.
-        crossed, one_edge, other_edge = -np.inf, -1, -1
-        if flush <= CLOSE * size:
-            by_edges = Edges(many, p, p_normal, edge[g], wing[g]), Edges(others, q, q_normal, edge[h], wing[h])
-            crossed, one_edge, other_edge = _crossing(by_edges[0], by_edges[1], slopes, tie, axis)
-        apart, laid = max(flush, crossed), 0
+        crossed, edges, axis = -np.inf, (-1, -1), (0.0, 0.0, 0.0)
+        if flush <= CLOSE * size:  # where faces part the two, edges matter only if no face is clearly the nearest
+            crossed, edges, axis = _crossing(both, count, sides, rows, tie, slopes)
+        apart = max(flush, crossed)
         if apart > reach:
             continue
-
-        # What is well within a face has its normal.
-        if flush >= apart - tolerance:
-            if other < 0:
-                _frame(p_normal[one], 1.0, p[corner[g, one, 0]], p[corner[g, one, 1]], frame)
-                last = _towards(others, corner[h], q, q_normal, frame[2], -1.0, tolerance)
-            else:
-                last = other
-                _frame(q_normal[last], -1.0, q[corner[h, last, 0]], q[corner[h, last, 1]], frame)
-                one = _towards(many, corner[g], p, p_normal, frame[2], 1.0, tolerance)
-            flush_faces = (corner[g, one], p, p_normal[one]), (corner[h, last], q, q_normal[last])
-            of_first, of_second, of_both, least = _overlaid(
-                flush_faces[0], flush_faces[1], frame, SNAP * size, reach, polygons, contacts_of_faces
-            )
+        if flush >= apart - tolerance:  # what is well within a face has its normal
+            opposite = _facing(both, count, corner, rows, by, tolerance, frame)
+            parts, least = _overlaid(both, corner, opposite, frame, SNAP * size, reach, polygons, shared)
             if least <= apart + tolerance:
-                laid = of_first + of_second + of_both
-                for k in range(laid):
-                    if k < of_first:
-                        feature[found + k] = corner[g, one, code[k]]
-                    elif k < of_first + of_second:
-                        feature[found + k] = most_v + corner[h, last, code[k]]
-                    else:
-                        sides = side[g, one, code[k] // s], side[h, last, code[k] % s]
-                        feature[found + k] = 2 * most_v + most_e * sides[0] + sides[1]
-                    out[found + k, 6] = spots[k, 3]
-                    for n in range(3):
-                        out[found + k, n], out[found + k, 3 + n] = center[m, n], frame[2, n]
-                        for i in range(3):
-                            out[found + k, n] += spots[k, i] * frame[i, n]
-                lines = line[0] if other < 0 else line[1]
-                corners = corner[g, one] if other < 0 else corner[h, last]
-                inside = _well_inside(spots, laid, corners, lines, ROUND * size * (sharp[g] + sharp[h]))
-                if laid == 0 or inside:
-                    for k in range(found, found + laid):
-                        pair[k] = m
+                laid = _lay(core.shape[1], sides, opposite, parts, shared, frame, (m, found), first[0], contacts)
+                if laid == 0 or _well_inside(shared[0], laid, corner, opposite, by[0], polygons[1], more):
                     found += laid
                     continue
-
-        # Else the direction is that of the closest points where edges and corners are round.
-        if flush > CLOSE * size:
-            by_edges = Edges(many, p, p_normal, edge[g], wing[g]), Edges(others, q, q_normal, edge[h], wing[h])
-            crossed, one_edge, other_edge = _crossing(by_edges[0], by_edges[1], slopes, tie, axis)
-        skin, cores, ends, share = ROUND * size, (core[0, : many[0]], core[1, : others[0]]), simplex.ends, simplex.share
-        _within(p, inset[g], turn[m], skin, cores[0])
-        _within(q, inset[h], other_turn[m], skin, cores[1])
-        extent, more = np.sqrt(dot(between, between)), skin * (sharp[g] + sharp[h])
-        count_in, core_gap = _distance(cores[0], cores[1], between, reach + more, extent, simplex)
+        if flush > CLOSE * size:  # else the direction is that of the closest points where edges and corners are round
+            crossed, edges, axis = _crossing(both, count, sides, rows, tie, slopes)
+        limits = reach, tie, tolerance, skin, more, CLOSE * size
+        closest = _closest_cores(both[0], (count, inset), turns, m, rows, between, limits, core, simplex)
+        core_gap, way, _, _ = closest
         if core_gap == np.inf:
             continue
-        for t in range(2):
-            _witness(cores[t], ends[:, t], share, count_in, core_place[t])
-        if core_gap > CLOSE * size and _separates(cores[0], cores[1], core_place, core_gap):
-            crossing = axis[0], axis[1], axis[2]
-            for t in range(3):
-                axis[t] = (core_place[1, t] - core_place[0, t]) / core_gap
-            i, k = _surface(p, ends[:, 0], share, count_in, core_place[0], axis, skin, place[0])
-            j, n = _surface(q, ends[:, 1], share, count_in, core_place[1], axis, -skin, place[1])
-            if laid > 0 and dot(axis, frame[2]) > 1.0 - PARALLEL:
-                for t in range(found, found + laid):
-                    pair[t] = m
-                found += laid
-                continue
-            gap = crossed + core_gap * (1.0 - dot(axis, crossing))
-            gap = max(gap, _rounded(many[1], p_normal, p_level, q, others[0], axis, 1.0, core_gap))
-            gap = max(gap, _rounded(others[1], q_normal, q_level, p, many[0], axis, -1.0, core_gap))
-            if gap > reach:
-                continue
-            one_body, other_body = Cored(p, cores[0], edge[g, : many[2]]), Cored(q, cores[1], edge[h, : others[2]])
-            limits = tolerance, core_gap + min(tolerance, reach - gap), skin
-            found, least = _on_edges(one_body, other_body, axis, 1.0, limits, 0, found, contacts)
-            own = found
-            found, lesser = _on_edges(other_body, one_body, axis, -1.0, limits, most_v, found, contacts)
-            found = _each_once(out, feature, start, own, found, 2.0 * skin)
-            if core_gap < min(least, lesser) - tie:
-                one_edge, other_edge = _edge_of(one_body.edge, i, k), _edge_of(other_body.edge, j, n)
-                name = i
-                if k >= 0 and n < 0:
-                    name = most_v + j
-                elif one_edge >= 0 and other_edge >= 0:
-                    name = 2 * most_v + most_e * one_edge + other_edge
-                at = start
-                while at < found and feature[at] != name:
-                    at += 1
-                feature[at], found = name, max(found, at + 1)
-                _set(
-                    out, at, 0.5 * (place[0, 0] + place[1, 0]), 0.5 * (place[0, 1] + place[1, 1]),
-                    0.5 * (place[0, 2] + place[1, 2]), axis[0], axis[1], axis[2], core_gap,
-                )  # fmt: skip
-            for k in range(start, found):
-                out[k, 6] += gap - core_gap
-        elif laid > 0:
-            for k in range(found, found + laid):
-                pair[k] = m
+        if laid > 0 and (core_gap == 0.0 or dot(way, frame[2]) > 1.0 - PARALLEL):
             found += laid
             continue
-        elif one_edge >= 0 and crossed >= flush - tolerance:
-            _between(
-                p[edge[g, one_edge, 0]], p[edge[g, one_edge, 1]], q[edge[h, other_edge, 0]], q[edge[h, other_edge, 1]],
-                place,
-            )  # fmt: skip
-            feature[found] = 2 * most_v + most_e * one_edge + other_edge
-            _set(
-                out, found, 0.5 * (place[0, 0] + place[1, 0]), 0.5 * (place[0, 1] + place[1, 1]),
-                0.5 * (place[0, 2] + place[1, 2]), axis[0], axis[1], axis[2], crossed,
-            )  # fmt: skip
-            found += 1
-        else:  # a corner in a face that the faces of the other, seen from it, are all too steep for
-            sign, best, k = 1.0 if other < 0 else -1.0, np.inf, 0
-            for n in range(others[0] if other < 0 else many[0]):
-                ahead = sign * dot(frame[2], q[n] if other < 0 else p[n])
-                if ahead < best:
-                    best, k = ahead, n
-            feature[found] = most_v + k if other < 0 else k
-            for n in range(3):
-                tip = q[k, n] if other < 0 else p[k, n]
-                out[found, n], out[found, 3 + n] = tip - 0.5 * sign * flush * frame[2, n], frame[2, n]
-            out[found, 6] = flush
-            found += 1
-        for k in range(start, found):
-            pair[k] = m
-            for n in range(3):
-                out[k, n] += center[m, n]
-    return len(hull), found
+        if core_gap > 0.0:
+            gap = max(crossed + core_gap * (1.0 - dot(way, axis)), _rounded(both, count, rows, way, core_gap))
+            found = _near_edges((both[0], core), count, edge, rows, closest, gap, limits, simplex, (found, contacts))
+        elif edges[0] >= 0 and crossed >= flush - tolerance:
+            found = _edges_crossed(both[0], edge, rows, edges, axis, crossed, found, contacts)
+        else:
+            found = _corner_in_face(both[0], count, rows, by[0], frame, flush, found, contacts)
+        _complete(m, start, found, first[0], contacts)
+    return len(delta), found
 
 
-@loop
-def _each_once(out, feature, start, own, found, close):
+@inlined
+def _parting_face(both, count, rows, reach, tie):
+    """How far the polyhedra are apart along the normal of a face, the furthest; whose it is, the first's or the
+    second's (0 or 1), and the face. Ends early where it is more than the reach."""
+    (points, normals, level), flush, own, face = both, -np.inf, 0, -1
+    for t in range(2):
+        g, h = rows[t], rows[1 - t]
+        flush, found = _beyond(count[g, 1], normals[t], level[t], points[1 - t], count[h, 0], reach, tie, flush, -1)
+        if found >= 0:
+            own, face = t, found
+        if flush > reach:
+            break
+    return flush, (own, face)
+
+
+@inlined
+def _facing(both, count, corner, rows, by, tolerance, frame):
+    """Of the first and of the second the row and the face: that which parts them and the one that looks back at it.
+    Fills in the frame, of which the normal of the first is the third axis."""
+    (points, normals, _), (t, face), sign = both, by, 1.0 - 2.0 * by[0]
+    h = rows[t]
+    _frame(normals[t, face], sign, points[t, corner[h, face, 0]], points[t, corner[h, face, 1]], frame)
+    back = _towards(1 - t, count, corner, rows[1 - t], both, frame[2], -sign, tolerance)
+    return ((h, face), (rows[1], back)) if t == 0 else ((rows[0], back), (h, face))
+
+
+@inlined
+def _lay(vertices, sides, opposite, parts, shared, frame, progress, center, contacts):
+    """Fill in the contacts, complete, of two faces that share `parts`: corners of the first, with those of the second,
+    and with crossings; how many."""
+    (corner, side, edge, _), ((g, one), (h, other)), (spots, code) = sides, opposite, shared
+    (m, found), (pair, feature, out) = progress, contacts
+    for k in range(parts[2]):
+        if k < parts[0]:
+            name = corner[g, one, code[k]]
+        elif k < parts[1]:
+            name = vertices + corner[h, other, code[k]]
+        else:
+            s = corner.shape[2]
+            name = 2 * vertices + edge.shape[1] * side[g, one, code[k] // s] + side[h, other, code[k] % s]
+        pair[found + k], feature[found + k], out[found + k, 6] = m, name, spots[k, 3]
+        for n in range(3):
+            place = center[m, n]
+            for i in range(3):
+                place += spots[k, i] * frame[i, n]
+            out[found + k, n], out[found + k, 3 + n] = place, frame[2, n]
+    return parts[2]
+
+
+@inner
+def _closest_cores(points, tables, turns, m, rows, between, limits, core, simplex):
+    """The distance of the polyhedra without their skins, inf if it is out of reach, zero where they overlap; the
+    direction from the first to the second; how many points of the simplex span it, and where it ends on both. Fills in
+    their vertices without skins."""
+    (count, inset), (reach, _, _, skin, more, close) = tables, limits
+    for t in range(2):
+        _within(points, count, inset, rows[t], turns[t], m, skin, t, core)
+    p, q = core[0, : count[rows[0], 0]], core[1, : count[rows[1], 0]]
+    many, gap = _distance(p, q, between, reach + more, np.sqrt(dot(between, between)), simplex)
+    one, two = _witness(FIRST, core, simplex, many), _witness(SECOND, core, simplex, many)
+    way = (two[0] - one[0]) / gap, (two[1] - one[1]) / gap, (two[2] - one[2]) / gap
+    if gap < np.inf and not (gap > close and _separates(p, q, one, two, gap)):
+        gap = 0.0
+    return gap, way, many, (one, two)
+
+
+@inner
+def _near_edges(points, count, edge, rows, closest, gap, limits, simplex, contacts):
+    """Add the contacts of this gap of polyhedra that are apart without their skins, if it is within reach: vertices
+    near edges, and the closest points if these are closer; the new number of contacts."""
+    (skins, core), (core_gap, axis, _, _), (reach, tie, tolerance, skin, _, _) = points, closest, limits
+    (start, contacts), least = contacts, np.inf
+    if gap > reach:
+        return start
+    own, found, near = start, start, (tolerance, core_gap + min(tolerance, reach - gap), skin)
+    for t in range(2):
+        own, g, h = found, rows[t], rows[1 - t]
+        cores = core[t, : count[g, 0]], core[1 - t, : count[h, 0]]
+        found, lesser = _on_edges(t, skins, cores, edge[h, : count[h, 2]], axis, near, found, contacts)
+        least = min(least, lesser)
+    found = _each_once(contacts, start, own, found, 2.0 * skin)
+    if core_gap < least - tie:
+        found = _add_closest(skins, (count, edge), rows, closest, skin, simplex, (start, found), contacts)
+    for k in range(start, found):
+        contacts[2][k, 6] += gap - core_gap
+    return found
+
+
+@inner
+def _add_closest(points, tables, rows, closest, skin, simplex, progress, contacts):
+    """Add the closest points, or put them in the place of the contact that has their name; the new number."""
+    (count, edge), (core_gap, axis, many, (one, two)), (at, found) = tables, closest, progress
+    _, feature, out = contacts
+    i, k, place = _surface(FIRST, points, simplex, many, one, axis, skin)
+    j, n, other = _surface(SECOND, points, simplex, many, two, axis, skin)
+    one_edge = _edge_of(edge, rows[0], count[rows[0], 2], i, k)
+    other_edge = _edge_of(edge, rows[1], count[rows[1], 2], j, n)
+    name = i
+    if k >= 0 and n < 0:
+        name = points.shape[1] + j
+    elif one_edge >= 0 and other_edge >= 0:
+        name = 2 * points.shape[1] + edge.shape[1] * one_edge + other_edge
+    while at < found and feature[at] != name:
+        at += 1
+    feature[at] = name
+    _set(out, at, _midway(place, other), axis, core_gap)
+    return max(found, at + 1)
+
+
+@inlined
+def _midway(a, b):
+    return 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])
+
+
+@inner
+def _edges_crossed(points, edge, rows, edges, axis, gap, found, contacts):
+    """Add the contact of two edges whose common normal is the axis; the new number of contacts."""
+    (g, h), (one, two), (_, feature, out) = rows, edges, contacts
+    a, b, c, d = edge[g, one, 0], edge[g, one, 1], edge[h, two, 0], edge[h, two, 1]
+    place = _between(points[0, a], points[0, b], points[1, c], points[1, d])
+    feature[found] = 2 * points.shape[1] + edge.shape[1] * one + two
+    _set(out, found, place, axis, gap)
+    return found + 1
+
+
+@inner
+def _corner_in_face(points, count, rows, own, frame, gap, found, contacts):
+    """Add the foremost corner in a face that the faces of the other one, seen from it, are all too steep for; the new
+    number of contacts."""
+    sign, best, tip, t, (_, feature, out), axis = 1.0 - 2.0 * own, np.inf, 0, 1 - own, contacts, frame[2]
+    for n in range(count[rows[t], 0]):
+        ahead = sign * dot(axis, points[t, n])
+        if ahead < best:
+            best, tip = ahead, n
+    feature[found] = t * points.shape[1] + tip
+    _set(out, found, plus(points[t, tip], -(0.5 * sign * gap), axis), (axis[0], axis[1], axis[2]), gap)
+    return found + 1
+
+
+@inner
+def _complete(m, start, found, center, contacts):
+    """Fill in the pair of contacts, and move them there from around its first polyhedron."""
+    for k in range(start, found):
+        contacts[0][k] = m
+        for n in range(3):
+            contacts[2][k, n] += center[m, n]
+
+
+@inner
+def _each_once(contacts, start, own, found, close):
     """Leave out the contacts from `own` on that are in the place of one from `start` on; the new number of contacts."""
-    to = own
+    (_, feature, out), to = contacts, own
     for k in range(own, found):
         is_new = True
         for n in range(start, own):
             x, y, z = out[k, 0] - out[n, 0], out[k, 1] - out[n, 1], out[k, 2] - out[n, 2]
-            is_new &= x * x + y * y + z * z > close * close
+            if not x * x + y * y + z * z > close * close:
+                is_new = False
+                break
         if is_new:
-            out[to], feature[to] = out[k], feature[k]
+            feature[to] = feature[k]
+            for n in range(7):
+                out[to, n] = out[k, n]
             to += 1
     return to
 
 
-@loop
-def _between(a, b, c, d, place):
-    """Fill in the points of two edges, from a to b and from c to d, where their lines are closest, or their ends."""
+@inner
+def _between(a, b, c, d):
+    """Midway of the points of two edges, from a to b and from c to d, where their lines are closest, or their ends."""
     u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     i, j, k = d[0] - c[0], d[1] - c[1], d[2] - c[2]
     x, y, z = c[0] - a[0], c[1] - a[1], c[2] - a[2]
@@ -796,39 +823,35 @@ def _between(a, b, c, d, place):
     square = uu * ii - ui * ui
     s = min(max((ux * ii - ix * ui) / square, 0.0), 1.0)
     t = min(max((ux * ui - ix * uu) / square, 0.0), 1.0)
-    for n in range(3):
-        place[0, n], place[1, n] = a[n] + s * (b[n] - a[n]), c[n] + t * (d[n] - c[n])
+    one, two = (a[0] + s * u, a[1] + s * v, a[2] + s * w), (c[0] + t * i, c[1] + t * j, c[2] + t * k)
+    return _midway(one, two)
 
 
 @loop
 def _spheres(spheres, faces, corner, body, delta, contacts):
     """Fill in the contacts of spheres with polyhedra; their number."""
-    (ball, radius), (center, turn, scale, hull), (pair, feature, out) = spheres, body, contacts
-    (_, count, vertex, normal) = faces
-    points, normals, level = np.empty(vertex.shape[1:]), np.empty(normal.shape[1:]), np.empty(normal.shape[1])
-    simplex, middle, found = no_simplex(), np.zeros((1, 3)), 0
-    point, share = simplex.point, simplex.share
+    (ball, radius), (center, _, _, hull), (pair, feature, out) = spheres, body, contacts
+    (_, count, vertex, normal), simplex, middle, found = faces, no_simplex(), np.zeros((1, 3)), 0
+    both = np.empty((1, vertex.shape[1], 3)), np.empty((1, normal.shape[1], 3)), np.empty((1, normal.shape[1]))
+    points, normals, level = both[0][0], both[1][0], both[2][0]
     for m in range(len(hull)):
-        reach = delta[m] + radius[m]
-        apart = center[m, 0] - ball[m, 0], center[m, 1] - ball[m, 1], center[m, 2] - ball[m, 2]
-        h = hull[m]
-        size = _place((count[h], vertex[h], normal[h], corner[h]), apart, turn[m], scale[m], points, normals, level)
-        gap, face = _beyond(count[h, 1], normals, level, middle, 1, reach, TIE * size, -np.inf, -1)
+        h, reach, apart = hull[m], delta[m] + radius[m], plus(center[m], -1.0, ball[m])
+        size = _place(faces, corner, body, m, apart, FIRST, both)
+        gap, face = _beyond(count[h, 1], normals, level, middle, SECOND, reach, TIE * size, -np.inf, -1)
         if gap > reach:
             continue
-        u, v, w = -normals[face, 0], -normals[face, 1], -normals[face, 2]
+        way = -normals[face, 0], -normals[face, 1], -normals[face, 2]
         if gap > CLOSE * size:
             many, gap = _distance(middle, points[: count[h, 0]], apart, reach, np.sqrt(dot(apart, apart)), simplex)
             if gap > reach:
                 continue
             u, v, w = 0.0, 0.0, 0.0
             for k in range(many):
-                u, v, w = u + share[k] * point[k, 0], v + share[k] * point[k, 1], w + share[k] * point[k, 2]
+                u, v, w = plus((u, v, w), simplex.share[k], simplex.point[k])
             gap = np.sqrt(u * u + v * v + w * w)
-            u, v, w = u / gap, v / gap, w / gap
+            way = u / gap, v / gap, w / gap
         gap -= radius[m]
-        ahead = radius[m] + 0.5 * gap
         pair[found], feature[found] = m, 0
-        _set(out, found, ball[m, 0] + ahead * u, ball[m, 1] + ahead * v, ball[m, 2] + ahead * w, u, v, w, gap)
+        _set(out, found, plus(ball[m], radius[m] + 0.5 * gap, way), way, gap)
         found += 1
     return found

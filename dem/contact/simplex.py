@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dem.arrays import Floats, Ints
-from dem.compiled import inlined, loop
+from dem.compiled import inlined, inner
 from dem.geometry.vectors import dot
 
 #: Corners and edges that are closer to each other across the normal than this share of the lesser half thickness of the
@@ -31,7 +31,7 @@ class Simplex(NamedTuple):
     parts: Floats  #: (6,) room for shares that are compared
 
 
-@loop
+@inner
 def no_simplex():
     """Room for one."""
     return Simplex(np.empty((4, 3)), np.empty((4, 2), np.int64), np.empty(4), np.empty(6))
@@ -73,7 +73,7 @@ def nearer(count, square, simplex):
     return count, better, x, y, z
 
 
-@loop
+@inner
 def _on_triangle(a, b, c, share):
     """Fill in the shares of the corners of a triangle in its point nearest to the origin (Ericson 2005, "Real-time
     collision detection", 5.1.5); its squared distance."""
