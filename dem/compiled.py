@@ -23,7 +23,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 prange = range  #: in compiled loops that of numba: passes of the loop go to threads, where there are several
 PART = 4096  #: rows of a sum's part: 100 kB of impulses, enough work for a thread
 
-_INNER = {"no_cpython_wrapper": True}
+_INNER = {"no_cpython_wrapper": True}  # of what compiled loops alone call
 _threads = 1
 
 
@@ -121,8 +121,8 @@ def inlined(function: Function) -> Function:
 
 
 def inner(function: Function) -> Function:
-    """A loop that other loops alone call. It has no door for Python, with a second copy of what is behind it, and is
-    compiled in half the time."""
+    """A loop that other loops alone call. numba makes no wrapper for calls from Python, into which LLVM would copy the
+    loop again: a loop of polyhedra is compiled in half the time. Python runs it as Python."""
     return cast(Function, Loop(function, _INNER))
 
 

@@ -51,7 +51,8 @@ _PLAIN = (int, float, complex, str, bytes, type(None), np.generic, np.dtype, enu
 
 
 class Inner(CPUDispatcher):
-    """A function that only compiled code may call; without this Python would call machine code that is not there."""
+    """A function without a wrapper for calls from Python, which runs it as Python: the machine code that a call would
+    look for is not there."""
 
     def __call__(self, *arguments: Any) -> Any:
         return self.py_func(*arguments)

@@ -20,7 +20,7 @@ import pctt
 from dem import quaternion
 from dem.arrays import places
 from dem.bodies import SPHERE
-from dem.compiled import loop
+from dem.compiled import inlined, inner, loop
 from dem.contact import broad
 from dem.contact.narrow import Spheres, sphere_sphere
 from dem.contact.spheres import touch_spheres
@@ -142,7 +142,7 @@ def test_machine_code_is_that_of_all_that_a_loop_reaches(tmp_path, monkeypatch):
             @inlined
             def twice(x): return deep.times(x)""",
         "loops": """
-            from dem.compiled import loop
+            from dem.compiled import inlined, inner, loop
             from small import vectors
             from small.vectors import FACTOR, Pair, twice
             def shifted_by(shift):
@@ -228,6 +228,22 @@ def test_a_loop_runs_where_numba_may_not_compile(monkeypatch):
         return 2.0 * x
 
     assert doubled(3.0) == 6.0
+
+
+@pytest.mark.parametrize("kind", [inner, inlined])
+def test_what_loops_alone_call_runs_in_python_too(kind):
+    """As Python: there is no machine code for it."""
+
+    @kind
+    def double(x):
+        return 2.0 * x
+
+    @loop
+    def four_times(x):
+        return double(double(x))
+
+    assert four_times(1.0) == 4.0
+    assert double(np.ones(2)).tolist() == [2.0, 2.0]
 
 
 def test_a_loop_has_nine_parameters_at_most():
