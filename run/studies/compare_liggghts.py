@@ -206,8 +206,8 @@ def atoms(start: Start) -> str:
     return "\n".join([*lines, "", "Atoms", "", *places, "", "Velocities", "", *speeds, ""])
 
 
-def script(start: Start, stiffness: float, steps: int) -> str:
-    """The input of LIGGGHTS."""
+def script(start: Start, stiffness: float, steps: int, ranks: int = 1) -> str:
+    """The input of LIGGGHTS, which shares the bed among ranks by halves of its length: by itself it would by height."""
     mixer, law = start.mixer, contact_law(stiffness, start.mass)
     dt, wall = law["dt"], start.mixer.width / 2
     properties = {"kn": stiffness, "kt": stiffness * 2 / 7, "gamman_abs": law["normal"]}
@@ -225,6 +225,7 @@ def script(start: Start, stiffness: float, steps: int) -> str:
         boundary f f f
         newton off
         communicate single vel yes
+        processors {ranks} 1 1
         units si
         read_data atoms.data
         neighbor {0.1 * mixer.radius} bin
@@ -380,7 +381,7 @@ def on_cores(n: int, seconds: float) -> Row:
         with tempfile.TemporaryDirectory() as name:
             put_input(folder := Path(name), start)
             for their_steps in (0, round(seconds / contact_law(STIFF, start.mass)["dt"])):
-                (folder / "script").write_text(script(start, STIFF, their_steps))
+                (folder / "script").write_text(script(start, STIFF, their_steps, ranks))
                 spent.append(liggghts_run(folder, ranks).seconds)
         _, lines = shared.settled_steps("mixer", n, steps + 1, "-ccp_type", "apgd", ranks=ranks)
         found[f"theirs_{ranks}"] = (spent[1] - spent[0]) / seconds
