@@ -19,4 +19,7 @@ _FACTORS: Options = {"ksp_type": "gmres", "ksp_gmres_restart": "60", "ksp_max_it
 DIRECT = {True: {**_FACTORS, "pc_type": "cholesky"}, False: {**_FACTORS, "pc_type": "lu"}}
 #: our own factors of the part of K that is worth it, by whether K is symmetric
 _FRONTS: Options = {**_FACTORS, "pc_type": "python", "pc_python_type": "pctt.ccp.newton.multifrontal.MultifrontalPC"}
-MULTIFRONTAL = {True: {**_FRONTS, "ksp_type": "cg", "ksp_norm_type": "unpreconditioned"}, False: _FRONTS}
+MULTIFRONTAL = {
+    True: {**_FRONTS, "ksp_type": "cg", "ksp_norm_type": "unpreconditioned"},
+    False: {**_FRONTS, "ksp_type": "fgmres"},  # bears the rounding of single precision
+}
