@@ -29,7 +29,7 @@ _InTree: Any = getattr(caching, "InTreeCacheLocator", None) or caching._InTreeCa
 
 
 class _NoCollection(event.Listener):
-    """Keeps the collector of cycles, which finds nothing there and takes a seventh of the time, out of compilations."""
+    """Keeps the collector of cycles out of compilations, where it takes a seventh of the time; it collects later."""
 
     inner, wanted = 0, False
 

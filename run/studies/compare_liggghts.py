@@ -22,7 +22,7 @@ show, or what their starts do, if that is more. Writes results/compare_liggghts.
 its section of docs/measurements.md and docs/liggghts.png, too.
 
 With --cores it measures seconds by the clock on one rank and on two, of one start: LIGGGHTS with 1e8 N/m, and our
-defaults. Without more words (10 minutes) it writes a section, too.
+defaults. Without more words it writes a section, too: 5 minutes, and half an hour once to settle the bed of n = 32.
 """
 
 from __future__ import annotations
@@ -491,7 +491,7 @@ other core is idle, commit {commit}.
 HEAD_OF_CORES = "## Beside LIGGGHTS on two cores\n"
 TEXT_OF_CORES = """`run/study compare_liggghts --cores` writes this section: seconds by the clock per
 simulated second of the same settled beds, on one rank and on two of an {cpu} of two cores, commit {commit}.
-LIGGGHTS has k = 1e8 N/m; ours are the defaults with `apgd`. n = 32 has 274,626 spheres; of it 0.05 s.
+LIGGGHTS has k = 1e8 N/m; ours are the defaults with `apgd`. n = 32 has 274,625 spheres; of it 0.05 s.
 
 {table}
 

@@ -142,7 +142,7 @@ def test_machine_code_is_that_of_all_that_a_loop_reaches(tmp_path, monkeypatch):
             @inlined
             def twice(x): return deep.times(x)""",
         "loops": """
-            from dem.compiled import inlined, inner, loop
+            from dem.compiled import loop
             from small import vectors
             from small.vectors import FACTOR, Pair, twice
             def shifted_by(shift):

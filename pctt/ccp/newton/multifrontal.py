@@ -275,9 +275,7 @@ def _cholesky(matrix: np.ndarray, below: np.ndarray, update: np.ndarray) -> tupl
     return (L, below), update
 
 
-def _lu(
-    matrix: np.ndarray, below: np.ndarray, beside: np.ndarray, update: np.ndarray
-) -> tuple[tuple, np.ndarray]:
+def _lu(matrix: np.ndarray, below: np.ndarray, beside: np.ndarray, update: np.ndarray) -> tuple[tuple, np.ndarray]:
     """L U of a front, and the update less what it takes."""
     getrf = lapack.get_lapack_funcs("getrf", dtype=matrix.dtype)
     trsm, gemm = blas.get_blas_funcs(("trsm", "gemm"), dtype=matrix.dtype)
