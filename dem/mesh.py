@@ -97,6 +97,24 @@ class Surface:
         return (count != 2) | (sine > 1e-5)
 
     @cached_property
+    def beyond(self) -> tuple[Ints, Ints, Ints]:
+        """The triangles beyond the sides of triangles (m, 3); whether they go up there, as seen along the normal (1),
+        down (-1), or on in the plane (0) (m, 3), which they also do where there is none or more than one; and the same
+        of these triangles, as seen from those beyond (m, 3)."""
+        side, face = self.side.ravel(), np.repeat(np.arange(len(self.triangle)), 3)
+        order = np.argsort(side, kind="stable")
+        one, two = order[:-1], order[1:]
+        shared = (np.bincount(side)[side[one]] == 2) & (side[one] == side[two])
+        one, two = one[shared], two[shared]
+        other = np.full(len(side), -1)
+        other[one], other[two] = two, one
+        opposite = np.roll(self.corner, 1, axis=1).reshape(-1, 3)
+        away = opposite[other] - self.corner[face, 0]
+        sine = np.einsum("ki,ki->k", away, self.normal[face]) / length(self.half)
+        turn = np.where((other < 0) | (np.abs(sine) < 1e-9), 0.0, np.sign(sine)).astype(np.int64)
+        return face[other].reshape(-1, 3), turn.reshape(-1, 3), turn[other].reshape(-1, 3)
+
+    @cached_property
     def hull(self) -> Ints:
         """The vertices that a plane can touch first: those of the convex hull, or all where that has no volume."""
         try:
@@ -120,6 +138,15 @@ class Surface:
         row, triangle = (np.concatenate(parts) for parts in zip(*found))
         close = self._within(points[row], triangle, reach[row] * (1.0 + 1e-9))
         return row[close], triangle[close]
+
+    def over(self, points: Floats, triangle: Ints) -> Floats:
+        """How far points (m, 3) are inside the three sides (m, 3) of triangles (m,), seen along the normals [m]."""
+        corner = self.corner[triangle]
+        sides = np.roll(corner, -1, axis=1) - corner
+        inward = cross(self.normal[triangle][:, None], sides)
+        size = length(inward)
+        inside = np.einsum("mki,mki->mk", points[:, None] - corner, inward)
+        return np.where(size > 0.0, inside / np.where(size > 0.0, size, 1.0), -np.inf)  # type: ignore[no-any-return]
 
     def _within(self, points: Floats, triangle: Ints, reach: Floats) -> Ints:
         """Which of triangles (m,) may be within reach (m,) [m] of points (m, 3), by the spheres about them and then by
@@ -207,8 +234,8 @@ def spread(start: Ints, of: Ints) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mesh:
-    """Triangles in space, which spheres and capsules touch from both sides. With a density the surface must be closed,
-    its normals outwards."""
+    """Triangles in space, which all shapes but meshes touch from both sides. With a density the surface must be
+    closed, its normals outwards."""
 
     vertices: ArrayLike  #: (n, 3) [m]
     triangles: ArrayLike | Ints  #: (m, 3) rows of vertices; seen from outside a solid they turn left

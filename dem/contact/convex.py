@@ -19,14 +19,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dem.arrays import Floats, Ints
-from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, half_thickness
+from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, enclosing_radius, half_thickness
 from dem.compiled import inlined, loop
 from dem.contact.ahead import Forms, Moving, Poses, Touching, after_turn, ahead_by, guest_is_second, spun, vector_of
-from dem.contact.narrow import DISTINCT, ContactBuffer, Manifold, Planes
-from dem.contact.polyhedra import Hulls
+from dem.contact.narrow import DISTINCT, ContactBuffer, Manifold, Planes, joined
+from dem.contact.polyhedra import Hulls, Polyhedra, polyhedra_planes
 from dem.contact.simplex import CLOSE, ROUND, SNAP, nearer, no_simplex
 from dem.contact.spheres import frame_of
 from dem.geometry.vectors import dot, plus
+from dem.quaternion import across, cross, length
 from dem.shapes import CONVEX_SHAPES
 from dem.shapes.convex import ConvexForm
 from dem.shapes.forms import Form
@@ -84,10 +85,14 @@ class Solids(NamedTuple):
     numbers: Floats  #: (m, 6) of a ball radius and 0, of a capsule radius and half length, of a box half extents
     hull: Ints  #: (m,) rows of `hulls`
     rounding: Floats  #: (m,) [m]
+    radius: Floats  #: (m,) of the spheres about the centres that enclose them [m]
 
     def tables(self) -> tuple[tuple[Floats, Floats, Floats, Floats], tuple[Ints, Floats, Ints, Floats]]:
         """Where they are and what they are, as loops take them."""
-        return self[:4], self[4:]
+        return self[:4], self[4:8]
+
+    def take(self, rows: Any) -> Solids:
+        return Solids(*(column[rows] for column in self))
 
 
 class Shape(NamedTuple):
@@ -129,7 +134,18 @@ def solids(kind: Ints, center: Floats, turn: Floats, size: Floats, hulls: Hulls,
     scale[other] = size[other, 0] / supports.radius[form]
     rounding[other] = supports.rounding[form] * scale[other]
     center, turn = np.ascontiguousarray(center), np.ascontiguousarray(turn)
-    return Solids(center, turn, scale, thick, what, numbers, hull, rounding)
+    return Solids(center, turn, scale, thick, what, numbers, hull, rounding, enclosing_radius(kind, size))
+
+
+def needles(start: Floats, end: Floats, thick: Floats) -> Solids:
+    """Segments from places (m, 3) to others [m], to be beside bodies of these half thicknesses (m,)."""
+    many, axis, numbers = len(start), 0.5 * (end - start), np.zeros((len(start), 6))
+    half = length(axis)
+    along = axis / np.where(half > 0.0, half, 1.0)[:, None]
+    one = across(along)
+    turn, numbers[:, 1] = np.stack([one, cross(along, one), along], axis=2), half
+    none, skin = np.zeros(many, np.int64), np.full(many, 1e-300)  # with none it would be given that of sharp edges
+    return Solids(0.5 * (start + end), turn, np.ones(many), thick, none + ROD, numbers, none, skin, half)
 
 
 def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) -> Manifold:
@@ -144,7 +160,22 @@ def solids_solids(first: Solids, second: Solids, delta: Floats, hulls: Hulls) ->
 
 
 def solids_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> Manifold:
-    """What of the body lies flush along the plane: the points of a face or a side, and the support."""
+    """What of the body lies flush along the plane: the points of a face or a side, and the support. Of boxes and
+    polyhedra all corners."""
+    cornered = (body.what == BLOCK) | (body.what == HULL)
+    if not cornered.any():
+        return _on_planes(body, plane, delta, hulls)
+    rows, others = np.flatnonzero(cornered), np.flatnonzero(~cornered)
+    scale = np.where((body.what == BLOCK)[:, None], body.numbers[:, :3], body.scale[:, None])[rows]
+    own = Polyhedra(body.center[rows], body.turn[rows], scale, body.hull[rows], hulls)
+    parts = [(rows, polyhedra_planes(own, Planes(*(column[rows] for column in plane)), delta[rows]))]
+    if len(others):
+        given = body.take(others), Planes(*(column[others] for column in plane)), delta[others]
+        parts.append((others, _on_planes(*given, hulls)))
+    return joined([found._replace(pair=numbers[found.pair]) for numbers, found in parts])
+
+
+def _on_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> Manifold:
     contacts, (outward, origin) = ContactBuffer.with_room(len(delta) * POINTS), map(np.ascontiguousarray, plane)
     given = *body.tables(), *_tables(hulls), (outward, origin), delta
     return contacts.manifold(_planes(*given, contacts[:]))
@@ -425,7 +456,7 @@ def _overlaid(flush, frame, slack, reach, found, contacts):
         return found, least
     for one in range(2):
         two = 1 - one
-        if count[two] < 3 or (one == 1 and count[0] > 2):
+        if count[two] < 3 or (one == 1 and count[1] > 2):
             continue
         first = SECOND if one else 0
         sides = count[one] if count[one] > 2 else 1

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
+from dem.contact.convex import CLOSEST, Solids, needles, solids_planes, solids_solids
 from dem.contact.narrow import (
     Capsules,
     Manifold,
@@ -24,8 +25,10 @@ from dem.contact.narrow import (
     end_ball,
     reversed_touch,
 )
+from dem.contact.polyhedra import TIE, Hulls
+from dem.contact.simplex import ROUND, SNAP
 from dem.mesh import Closest, Surface, spread
-from dem.quaternion import length
+from dem.quaternion import cross, length
 
 #: Sine of the angle by which a direction may leave those in which an edge or a vertex is closest, for rounding.
 ROUNDING = 1e-6
@@ -35,6 +38,9 @@ ROCKING = 0.1
 
 #: Features of a capsule on a surface: those of the surface for each end ball, and for the core between.
 PARTS = 3
+
+#: Features of other shapes on a surface: those of the surface for each name of a contact, and once more.
+NAMES = CLOSEST + 2
 
 
 class PlacedMesh(NamedTuple):
@@ -93,6 +99,112 @@ def capsule_mesh(capsule: Capsules, mesh: PlacedMesh, delta: Floats) -> Manifold
     short = (dot(through.away, core.axis[through.row]) < 0.0).astype(np.int64)
     stuck = PARTS * surface.features * through.row + through.feature + (short - 2) * surface.features
     return found.take(~np.isin(PARTS * surface.features * found.row + found.feature, stuck)).manifold(mesh)
+
+
+def solid_mesh(body: Solids, mesh: PlacedMesh, delta: Floats, hulls: Hulls) -> Manifold:
+    """Convex shapes and one surface: corners and supports of the shapes over faces, and edges and vertices of the
+    surface on the shapes."""
+    surface, thick = mesh.surface, body.thick
+    center, turn = (body.center - mesh.middle) @ mesh.turn, np.ascontiguousarray(mesh.turn.T @ body.turn)
+    body = body._replace(center=center, turn=turn)
+    row, triangle = surface.near(center, body.radius + delta)
+    over = _over_faces(row, triangle, body, delta, hulls, surface)
+    ridges = _on_ridges(row, triangle, body, delta, hulls, surface)
+    found = _SurfaceContacts(*(np.concatenate(columns) for columns in zip(over, ridges)))
+    return found.take(_apart(found, SNAP * thick)).manifold(mesh)
+
+
+def _over_faces(
+    row: Ints, triangle: Ints, body: Solids, delta: Floats, hulls: Hulls, surface: Surface
+) -> _SurfaceContacts:
+    """Where corners and supports of shapes are over faces, or have gone through them from the side of the centre."""
+    normal, origin, center = surface.normal[triangle], surface.corner[triangle, 0], body.center[row]
+    outward = np.copysign(1.0, dot(center - origin, normal))[:, None] * normal
+    pair, name, touch = solids_planes(body.take(row), Planes(outward, origin), delta[row], hulls)
+    row, triangle, outward, center, gap = row[pair], triangle[pair], outward[pair], center[pair], touch.gap
+    foot = touch.point - 0.5 * gap[:, None] * outward
+    deep = np.flatnonzero(gap < 0.0)  # the way from the centre must go through the triangle
+    share = (height := dot((center - foot)[deep], outward[deep])) / (height - gap[deep])
+    way = foot.copy()
+    way[deep] = center[deep] + share[:, None] * (foot + gap[:, None] * outward - center)[deep]
+    found = _SurfaceContacts(row, triangle + name * surface.features, foot, outward, gap)
+    return found.take(_within_sides(row, triangle, outward, surface.over(way, triangle), body, hulls, surface))
+
+
+def _within_sides(
+    row: Ints, triangle: Ints, outward: Floats, inside: Floats, body: Solids, hulls: Hulls, surface: Surface
+) -> Bools:
+    """Which of the places on triangles, on the side `outward` (k, 3), that are inside of their sides by `inside` (k, 3)
+    [m] are contacts.
+
+    In a groove a body may have gone through both sides. What is behind a ridge, as seen from the body, is hidden.
+    Beyond a ridge are corners of bodies that lie on it: without their skin they may be over the face, so that the ridge
+    has no contact."""
+    beyond, turn, back = (column[triangle] for column in surface.beyond)
+    thick, up = body.thick[row, None], turn * np.sign(dot(outward, surface.normal[triangle]))[:, None]
+    height = dot(body.center[row, None] - surface.corner[beyond, 0], surface.normal[beyond])
+    hidden = (up > 0.0) & (back * height <= 0.0)
+    within = inside >= -thick * np.select([hidden, up > 0.0], [-ROUND, ROUND], TIE)
+    edged = (up < 0.0) & (body.rounding[row, None] == 0.0) & ~within & (inside >= -2.0 * ROUND * thick)
+    n, k = np.nonzero(edged & (within | edged).all(axis=1)[:, None])
+    start, end = surface.corner[triangle[n], k], surface.corner[triangle[n], (k + 1) % 3]
+    inward = cross(surface.normal[triangle[n]], end - start)
+    side = Planes(-inward / length(inward)[:, None], start)
+    over = np.unique(solids_planes(body.take(row[n]), side, -SNAP * body.thick[row[n]], hulls).pair)
+    within[n[over], k[over]] = True
+    return within.all(axis=1)  # type: ignore[no-any-return]
+
+
+def _on_ridges(
+    row: Ints, triangle: Ints, body: Solids, delta: Floats, hulls: Hulls, surface: Surface
+) -> _SurfaceContacts:
+    """Where edges of the surface, with the vertices at their ends, are closest to shapes, among the surface around
+    them."""
+    row, edge = _each_once(row, surface.side[triangle], surface.ridges)
+    one, two = np.moveaxis(surface.vertex[surface.edge[edge]], 1, 0)
+    size, away = length(two - one), body.center[row] - one
+    along = (two - one) / size[:, None]
+    foot = dot(away, along)
+    half = np.sqrt(np.maximum((body.radius + delta)[row] ** 2 - (dot(away, away) - foot**2), 0.0))
+    low, high = np.maximum(foot - half, 0.0), np.minimum(foot + half, size)  # what of it is within reach
+    within = low < high
+    row, edge, one, along, low, high, size = (c[within] for c in (row, edge, one, along, low, high, size))
+    rod = needles(one + low[:, None] * along, one + high[:, None] * along, body.thick[row])
+    pair, name, touch = solids_solids(body.take(row), rod, delta[row], hulls)
+    # Sharp bodies that lie on the edge have no point there that is closer than those of their faces.
+    lies = np.zeros(len(row), bool)
+    lies[pair[name != CLOSEST]] = True
+    keep = (name != CLOSEST) | ~lies[pair] | (body.rounding[row[pair]] > 0.0)
+    pair, name, touch = pair[keep], name[keep], touch.take(keep)
+
+    row, edge, away = row[pair], edge[pair], -touch.normal
+    place = touch.point - 0.5 * touch.gap[:, None] * away
+    t, close = dot(place - one[pair], along[pair]), SNAP * body.thick[row]
+    count = len(surface.triangle)
+    feature, vertex = count + edge, np.full(len(row), -1)
+    for at, end in ((t < close, 0), (t > size[pair] - close, 1)):
+        vertex[at] = surface.edge[edge[at], end]
+    feature = np.where(vertex >= 0, count + len(surface.edge) + vertex, feature)
+    found = _SurfaceContacts(row, feature, place, away, touch.gap)
+    near = np.flatnonzero(_within_cone(surface, feature, place, away, ROCKING))
+    # An edge has several contacts, a vertex, at which several edges end, one: with a face, if there is one.
+    near = near[np.lexsort((touch.gap[near], name[near] == CLOSEST))]
+    feature = np.where(vertex[near] >= 0, feature[near], feature[near] + (1 + name[near]) * surface.features)
+    _, first = np.unique(row[near] * (NAMES * surface.features) + feature, return_index=True)
+    return found.take(near)._replace(feature=feature).take(first)
+
+
+def _apart(found: _SurfaceContacts, close: Floats) -> Ints:
+    """Which contacts are not within close (m,) [m] of one of lesser gap that has almost the same direction."""
+    order = np.lexsort((found.feature, found.gap, found.row))
+    row = found.row[order]
+    start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(close)))])
+    later, earlier = spread(start, row)
+    pair = np.flatnonzero(earlier < later)
+    later, earlier = order[later[pair]], order[earlier[pair]]
+    same = length(found.point[later] - found.point[earlier]) <= close[found.row[later]]
+    same &= dot(found.away[later], found.away[earlier]) > 0.99
+    return np.setdiff1d(order, later[same])
 
 
 def plane_mesh(plane: Planes, mesh: PlacedMesh, delta: Floats) -> Manifold:

@@ -14,7 +14,7 @@ from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPH
 from dem.contact.ahead import Course, Forms, Poses, hosts_first, seen_from, turn_ahead
 from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.convex import Solids, Supports, arcs_of, solids, solids_planes, solids_solids, supports_of
-from dem.contact.meshes import PARTS, PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
+from dem.contact.meshes import NAMES, PlacedMesh, capsule_mesh, plane_mesh, solid_mesh, sphere_mesh
 from dem.contact.narrow import (
     Boxes,
     Capsules,
@@ -189,7 +189,7 @@ def extents(shapes: list[tuple[Shape, ...]]) -> Floats:
 
 def numbers_of(shape: Shape, features: int) -> int:
     """How many numbers a part takes, that its features may be distinct: polyhedra have the most but for meshes."""
-    return 1 + (PARTS * shape.surface.features - 1) // features if isinstance(shape, Mesh) else 1
+    return 1 + (NAMES * shape.surface.features - 1) // features if isinstance(shape, Mesh) else 1
 
 
 def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course | None = None) -> Manifold:
@@ -249,13 +249,13 @@ def _touching(
     if course is not None:
         center, turn, travel = seen_from(*table.tables(), course[:], i, j)
         guests, delta = guests._replace(center=center, quaternion=turn), delta + travel
+    further = (table.hulls,) if first is Primitives.solid or second is Primitives.solid else ()
     if second is not None:
-        further = (table.hulls,) if first is Primitives.solid or second is Primitives.solid else ()
         return contacts(first(guests, slice(None)), second(table, j), delta, *further)
     found = []
     for mesh in np.unique(j):
         rows = np.flatnonzero(j == mesh)
-        contact = contacts(first(guests, rows), table.mesh(int(mesh)), delta[rows])
+        contact = contacts(first(guests, rows), table.mesh(int(mesh)), delta[rows], *further)
         found.append(contact._replace(pair=rows[contact.pair]))
     return joined(found)
 
@@ -281,9 +281,11 @@ _TOUCH: dict[tuple[int, int], tuple[Callable[..., Manifold], Callable[..., Any],
     (_POLYHEDRON, PLANE): (polyhedra_planes, Primitives.polyhedron, Primitives.plane),
     **{(kind, _CONVEX): (solids_solids, Primitives.solid, Primitives.solid) for kind in (SPHERE, CAPSULE, _CONVEX)},
     **{(_CONVEX, kind): (solids_solids, Primitives.solid, Primitives.solid) for kind in (BOX, _POLYHEDRON)},
+    (CAPSULE, _POLYHEDRON): (solids_solids, Primitives.solid, Primitives.solid),
     (_CONVEX, PLANE): (solids_planes, Primitives.solid, Primitives.plane),
     (SPHERE, MESH): (sphere_mesh, Primitives.sphere, None),
     (CAPSULE, MESH): (capsule_mesh, Primitives.capsule, None),
+    **{(kind, MESH): (solid_mesh, Primitives.solid, None) for kind in (BOX, _POLYHEDRON, _CONVEX)},
     (PLANE, MESH): (plane_mesh, Primitives.plane, None),
 }  # fmt: skip
 
