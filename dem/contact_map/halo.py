@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import weakref
 
 import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Ints
+from dem.compiled import loop
 from dem.exchange import exchange, offsets
 
 TAG = 4711  # of the messages of halos; those of one pair of ranks keep their order
@@ -53,7 +55,7 @@ class Halo:
         """Lower the values of the owners to the least of their ghosts."""
         self.begin_add(values)
         for rows, arrived in self._wait():
-            values[rows] = np.minimum(values[rows], arrived)
+            values[rows] = np.minimum(values[rows], arrived.reshape(-1, *values.shape[1:]))
 
     def begin_update(self, values: np.ndarray) -> None:
         """Owners may change their values after this, and read those of ghosts after `end_update`."""
@@ -61,7 +63,7 @@ class Halo:
 
     def end_update(self, values: np.ndarray) -> None:
         for rows, arrived in self._wait():
-            values[rows] = arrived
+            _put(arrived, rows, _flat(values))
 
     def begin_add(self, values: np.ndarray) -> None:
         """Owners may still change their own values until `end_add`."""
@@ -69,7 +71,7 @@ class Halo:
 
     def end_add(self, values: np.ndarray) -> None:
         for rows, arrived in self._wait():  # in the order of the ranks, so that sums repeat themselves
-            values[rows] += arrived
+            _add(arrived, rows, _flat(values))
 
     def _send(self, values: np.ndarray, rows: Ints, changed: Ints, to: Pieces, by: Pieces) -> None:
         """Begin to send ``rows`` of the values to some ranks; the rows ``changed`` are those of what others send."""
@@ -82,7 +84,7 @@ class Halo:
         self._open.start(values)
 
     def _wait(self) -> list[tuple[Ints, np.ndarray]]:
-        """Rows and what has arrived for them, of each rank."""
+        """Rows and what has arrived for them, as tables (rows, n), of each rank."""
         messages, self._open = self._open, None
         return messages.wait() if messages else []
 
@@ -94,7 +96,7 @@ class Messages:
         _, shape, dtype = kind
         self._rows, self._leaving = rows, np.empty((len(rows), *shape), dtype)
         arriving = np.empty((len(changed), *shape), dtype)
-        self._parts = [(changed[piece], arriving[piece]) for _, piece in by]
+        self._parts = [(changed[piece], _flat(arriving[piece])) for _, piece in by]
         requests = [comm.Recv_init(arriving[piece], rank, TAG) for rank, piece in by]
         requests += [comm.Send_init(self._leaving[piece], rank, TAG) for rank, piece in to]
         self._requests = requests
@@ -107,6 +109,29 @@ class Messages:
     def wait(self) -> list[tuple[Ints, np.ndarray]]:
         MPI.Request.Waitall(self._requests)
         return self._parts
+
+
+def _flat(values: np.ndarray) -> np.ndarray:
+    """A C-contiguous array (rows, ...) as a table (rows, n)."""
+    return values.reshape(len(values), math.prod(values.shape[1:]))
+
+
+@loop
+def _put(values, rows, out):
+    """out[rows] = values."""
+    for k in range(len(rows)):
+        row = rows[k]
+        for n in range(values.shape[1]):
+            out[row, n] = values[k, n]
+
+
+@loop
+def _add(values, rows, out):
+    """out[rows] += values, where each row is there once."""
+    for k in range(len(rows)):
+        row = rows[k]
+        for n in range(values.shape[1]):
+            out[row, n] += values[k, n]
 
 
 def _free(requests: list[MPI.Prequest]) -> None:
