@@ -33,7 +33,7 @@ from dem.mesh import Mesh
 from dem.motion import Dynamic, Glide, Guided, Held, Hinged, Oscillation, Rotation
 from dem.parts.sizes import Uniform
 from dem.scene import Scene
-from dem.shapes import Box, Capsule, Clump, Plane, Sphere
+from dem.shapes import Box, Capsule, Clump, Cylinder, Plane, Sphere, Superellipsoid
 from dem.together import SceneError
 
 G = 9.81
@@ -138,7 +138,7 @@ def mixture(seed: int) -> Mixture:
     places = add_grains(draw, made, count, pitch, density, more)
     walls(draw, made, boundary, size)
     if boundary in ("walls", "mesh", "boxes") and draw.chance(0.5):
-        add_tool(draw, made, size, density, rocks="rocks" in made.features, mesh=boundary == "mesh")
+        add_tool(draw, made, size, density, mesh=boundary == "mesh")
     if not cell and boundary != "channel" and draw.chance(0.3):
         add_springs(draw, made, len(places), density)
     rains = boundary in ("walls", "boxes", "mesh", "channel") and draw.chance(0.3)
@@ -170,12 +170,8 @@ def laws_of(draw: Draw, radius: float) -> dict[str, float]:
 
 def add_grains(draw: Draw, made: Mixture, count: np.ndarray, pitch: float, density: float, more: Row) -> np.ndarray:
     """Grains of some shapes near the places of a lattice; their centres (n, 3) in the order of their ids."""
-    radius, kinds = made.radius, ["spheres", "boxes", "capsules", "clumps", "rocks"]
-    if made.features[0] == "mesh":
-        kinds = ["spheres", "capsules", "clumps"]
+    radius, kinds = made.radius, ["spheres", "boxes", "capsules", "clumps", "rocks", "cylinders", "superellipsoids"]
     chosen = [kind for kind in kinds if draw.chance(0.4)] or ["spheres"]
-    if {"rocks", "capsules"} <= set(chosen):
-        chosen.remove(draw.one("rocks", "capsules"))
     grid = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
     places = pitch * radius * grid + draw.rng.uniform(-0.1, 0.1, grid.shape) * radius
     speed, spin = draw.one(0.0, 1.0, 3.0), draw.one(0.0, 1.0, 3.0)
@@ -205,6 +201,12 @@ def add_grains(draw: Draw, made: Mixture, count: np.ndarray, pitch: float, densi
             centres = np.array([[0, 0, 0], [0.5, 0, 0], [0.1, 0.4, 0.2]])
             clump = Clump(radius * centres, radius * np.array([0.45, 0.35, 0.3]))
             made.scene.add_clumps(at, clump, heavy, **given)
+        elif kind == "cylinders":
+            made.scene.add_grains(at, Cylinder(0.5 * radius, draw.one(0.2, 1.5) * radius), heavy, **given)
+        elif kind == "superellipsoids":
+            axes = radius * draw.rng.uniform(0.3, 0.57, 3)
+            shape = Superellipsoid(tuple(axes), draw.one((2.0, 2.0), (4.0, 3.0), (8.0, 8.0)))
+            made.scene.add_grains(at, shape, heavy, **given)
         else:
             made.scene.add_polyhedra(at, 0.95 * radius * draw.rock(), heavy, **given)
     return places[np.concatenate(order)]
@@ -251,12 +253,11 @@ def walls(draw: Draw, made: Mixture, boundary: str, size: np.ndarray) -> None:
         made.low, made.high = low, np.array([*high[:2], np.inf])
 
 
-def add_tool(draw: Draw, made: Mixture, size: np.ndarray, density: float, rocks: bool, mesh: bool) -> None:
+def add_tool(draw: Draw, made: Mixture, size: np.ndarray, density: float, mesh: bool) -> None:
     """A body above the grains that is driven, or falls."""
     radius, at = made.radius, size * [0.5, 0.5, 1.0] + [0, 0, 1.8 * made.radius]
-    shapes = [Sphere(radius)]
-    shapes += [] if mesh else [Box((radius, 0.5 * radius, 0.7 * radius))]
-    shapes += [] if rocks else [Capsule(0.5 * radius, 0.5 * radius)]
+    shapes = [Sphere(radius), Box((radius, 0.5 * radius, 0.7 * radius)), Capsule(0.5 * radius, 0.5 * radius)]
+    shapes += [] if mesh else [wedge(radius)]  # two meshes do not touch
     force = density * radius**3 * 500.0
     motion = draw.one(
         Glide((0, 0, -0.5)),
@@ -267,11 +268,22 @@ def add_tool(draw: Draw, made: Mixture, size: np.ndarray, density: float, rocks:
         Held((None, 0, None), (0, 4.0, 0)),
         Rotation((0, 5.0, 0), center=tuple(at + [0, 0, radius])),
     )
-    given = {"density": density * draw.one(0.1, 1.0, 100.0)} if isinstance(motion, Dynamic) else {}
-    shape = draw.one(*shapes)
+    shape, given, heavy = draw.one(*shapes), {}, density * draw.one(0.1, 1.0, 100.0)
+    if isinstance(motion, Dynamic):
+        mass = 1.4 * heavy * radius**3
+        given = {"density": heavy}
+        if isinstance(shape, Mesh):  # whose own needs another package
+            given = {"mass": mass, "inertia": (0.4 * mass * radius**2,) * 3}
     made.scene.add_body("tool", [shape], motion, position=at, **given)
     made.fed.append(f"{type(motion).__name__} tool")
     made.pressed |= isinstance(motion, Guided)
+
+
+def wedge(radius: float) -> Mesh:
+    """A closed solid of eight triangles."""
+    corners = radius * np.array([(x, y, 0) for x in (-1, 1) for y in (-0.7, 0.7)] + [(-1, -0.7, 1), (-1, 0.7, 1)])
+    faces = [(0, 1, 2), (1, 3, 2), (0, 4, 1), (1, 4, 5), (0, 2, 4), (1, 5, 3), (2, 3, 4), (3, 5, 4)]
+    return Mesh(corners - corners.mean(axis=0), faces)
 
 
 def add_springs(draw: Draw, made: Mixture, grains: int, density: float) -> None:
