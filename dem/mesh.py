@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from dem.arrays import ArrayLike, Floats, Ints
+from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.checks import between, check_fields, finite, not_negative, positive, rows, unit_quaternion, vector
 from dem.compiled import loop
 from dem.geometry import stl
@@ -85,6 +85,15 @@ class Surface:
         vertex = np.concatenate([opposite.ravel(), self.edge[:, 1], self.edge[:, 0]])
         start = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=count + len(self.vertex)))])
         return start, vertex[np.argsort(of, kind="stable")]
+
+    @cached_property
+    def loose(self) -> Bools:
+        """Which edges, and behind them which vertices (edges + vertices,), other triangles may meet that do not have
+        them: edges that are not those of two triangles, and their ends."""
+        edges = np.bincount(self.side.ravel(), minlength=len(self.edge)) != 2
+        vertices = np.zeros(len(self.vertex), bool)
+        vertices[self.edge[edges]] = True
+        return np.concatenate([edges, vertices])
 
     @cached_property
     def ridges(self) -> np.ndarray:

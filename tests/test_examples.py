@@ -153,6 +153,10 @@ def test_the_bucket_is_a_scene_with_a_tool_from_a_file(tmp_path, monkeypatch):
     assert [body.name for body in scene.large_bodies] == ["tray", "bucket"]
     _, records = run("bucket", 2, scene_file=str(tmp_path / "bucket.stl"))
     assert records["lifted [kg]"].tolist() == [0.0, 0.0]
+    _, records = run("bucket", 2, scene_file=str(tmp_path / "bucket.stl"), scene_grains="stones")
+    assert records["lifted [kg]"].tolist() == [0.0, 0.0]
+    with pytest.raises(ValueError, match="grains cubes: allowed are spheres and stones"):
+        from_file(EXAMPLES / "bucket.py")(grains="cubes")
 
 
 def test_the_bucket_digs_in_the_bed_that_it_meets():

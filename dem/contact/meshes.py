@@ -104,14 +104,14 @@ def capsule_mesh(capsule: Capsules, mesh: PlacedMesh, delta: Floats) -> Manifold
 def solid_mesh(body: Solids, mesh: PlacedMesh, delta: Floats, hulls: Hulls) -> Manifold:
     """Convex shapes and one surface: corners and supports of the shapes over faces, and edges and vertices of the
     surface on the shapes."""
-    surface, thick = mesh.surface, body.thick
+    surface = mesh.surface
     center, turn = (body.center - mesh.middle) @ mesh.turn, np.ascontiguousarray(mesh.turn.T @ body.turn)
     body = body._replace(center=center, turn=turn)
     row, triangle = surface.near(center, body.radius + delta)
     over = _over_faces(row, triangle, body, delta, hulls, surface)
     ridges = _on_ridges(row, triangle, body, delta, hulls, surface)
     found = _SurfaceContacts(*(np.concatenate(columns) for columns in zip(over, ridges)))
-    return found.take(_apart(found, SNAP * thick)).manifold(mesh)
+    return found.take(_distinct(found, body, surface)).manifold(mesh)
 
 
 def _over_faces(
@@ -160,10 +160,11 @@ def _on_ridges(
 ) -> _SurfaceContacts:
     """Where edges of the surface, with the vertices at their ends, are closest to shapes, among the surface around
     them."""
+    near_row, near_triangle = row, triangle
     row, edge = _each_once(row, surface.side[triangle], surface.ridges)
     one, two = np.moveaxis(surface.vertex[surface.edge[edge]], 1, 0)
     size, away = length(two - one), body.center[row] - one
-    along = (two - one) / size[:, None]
+    along = (two - one) / np.where(size > 0.0, size, 1.0)[:, None]
     foot = dot(away, along)
     half = np.sqrt(np.maximum((body.radius + delta)[row] ** 2 - (dot(away, away) - foot**2), 0.0))
     low, high = np.maximum(foot - half, 0.0), np.minimum(foot + half, size)  # what of it is within reach
@@ -186,25 +187,48 @@ def _on_ridges(
         vertex[at] = surface.edge[edge[at], end]
     feature = np.where(vertex >= 0, count + len(surface.edge) + vertex, feature)
     found = _SurfaceContacts(row, feature, place, away, touch.gap)
-    near = np.flatnonzero(_within_cone(surface, feature, place, away, ROCKING))
+    least = _within_cone(surface, feature, place, away, ROCKING)
+    least &= _beside(near_row, near_triangle, found, body.thick, surface)
+    near = np.flatnonzero(least)
     # An edge has several contacts, a vertex, at which several edges end, one: with a face, if there is one.
     near = near[np.lexsort((touch.gap[near], name[near] == CLOSEST))]
-    feature = np.where(vertex[near] >= 0, feature[near], feature[near] + (1 + name[near]) * surface.features)
-    _, first = np.unique(row[near] * (NAMES * surface.features) + feature, return_index=True)
-    return found.take(near)._replace(feature=feature).take(first)
+    named = feature[near] + (1 + name[near]) * surface.features
+    each = row[near] * (NAMES * surface.features) + np.where(vertex[near] >= 0, feature[near], named)
+    _, first = np.unique(each, return_index=True)
+    return found.take(near)._replace(feature=named).take(first)
 
 
-def _apart(found: _SurfaceContacts, close: Floats) -> Ints:
-    """Which contacts are not within close (m,) [m] of one of lesser gap that has almost the same direction."""
+def _beside(row: Ints, triangle: Ints, found: _SurfaceContacts, thick: Floats, surface: Surface) -> Bools:
+    """Which contacts of edges and vertices are closest, too, among the near triangles (n,) of their rows that they lie
+    in, though these do not have them: as where the corners of one meet the side of another."""
+    loose = np.flatnonzero(surface.loose[found.feature - len(surface.triangle)])
+    start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(thick)))])
+    own, entry = spread(start, found.row[loose])
+    own, other = loose[own], triangle[np.argsort(row, kind="stable")[entry]]
+    meet = surface.closest(found.point[own], other).distance <= 1e-6 * thick[found.row[own]]
+    own, other = own[meet], other[meet]
+    way = surface.corner[other] - found.point[own, None]
+    ahead = dot(way, found.away[own, None]) > ROCKING * length(way) + 1e-6 * thick[found.row[own], None]
+    beside = np.ones(len(found.row), bool)
+    beside[own[ahead.any(axis=1)]] = False
+    return beside
+
+
+def _distinct(found: _SurfaceContacts, body: Solids, surface: Surface) -> Ints:
+    """Which contacts are not within SNAP half thicknesses of one of lesser gap and almost the same direction, nor those
+    of a ridge beside a corner that is over a face: its direction is that of a corner without its skin."""
     order = np.lexsort((found.feature, found.gap, found.row))
-    row = found.row[order]
-    start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(close)))])
-    later, earlier = spread(start, row)
-    pair = np.flatnonzero(earlier < later)
-    later, earlier = order[later[pair]], order[earlier[pair]]
-    same = length(found.point[later] - found.point[earlier]) <= close[found.row[later]]
-    same &= dot(found.away[later], found.away[earlier]) > 0.99
-    return np.setdiff1d(order, later[same])
+    start = np.concatenate([[0], np.cumsum(np.bincount(found.row, minlength=len(body.thick)))])
+    one, two = spread(start, found.row[order])
+    one, two, before = order[one], order[two], two < one
+    thick = body.thick[found.row[one]]
+    apart, lower = length(found.point[one] - found.point[two]) / thick, (found.gap[two] - found.gap[one]) / thick
+    same = before & (apart <= SNAP) & (dot(found.away[one], found.away[two]) > 0.99)
+    name, feature = np.divmod(found.feature, surface.features)
+    over = feature < len(surface.triangle)
+    bevel = ~over & (name == 1 + CLOSEST) & (body.rounding[found.row] == 0.0)
+    same |= bevel[one] & over[two] & (apart <= 2.0 * ROUND) & (lower <= ROUND)
+    return np.setdiff1d(order, one[same])
 
 
 def plane_mesh(plane: Planes, mesh: PlacedMesh, delta: Floats) -> Manifold:

@@ -1,8 +1,8 @@
-"""A bucket from an STL file goes round and scoops spheres out of a tray::
+"""A bucket from an STL file goes round and scoops stones, or spheres, out of a tray::
 
     python docs/examples/bucket.py bucket.stl  # writes the file, in millimetres; a drawing of your own does as well
-    python -m pctt.run -scene docs/examples/bucket.py -scene_file bucket.stl -ccp_type apgd -steps 400 \
-        -output_every 4 -output bucket
+    python -m pctt.run -scene docs/examples/bucket.py -scene_file bucket.stl -scene_grains stones \
+        -dt 1e-3 -delta 1e-4 -ccp_type apgd -steps 1600 -output_every 20 -output bucket
     python -m pctt.render bucket -size 640x480
 """
 
@@ -22,21 +22,36 @@ ARM = 0.072  # from the axis to the middle of the bucket's bottom [m]
 
 @dataclass(frozen=True)
 class Bucket(Experiment):
-    """Spheres settle in a tray; then a bucket at the end of an arm turns once about a horizontal axis."""
+    """Grains settle in a tray; then a bucket at the end of an arm turns once about a horizontal axis."""
 
     file: str = option("bucket.stl", "STL or OBJ file of the bucket, which opens along its z axis")
     scale: float = option(1e-3, "unit of the numbers in the file", unit="m")
     period: float = option(1.5, "time of a turn", unit="s")
+    grains: str = option("spheres", "shape of the grains: spheres or stones")
     friction: float = option(0.5, "friction coefficient of all contacts")
     dt = 0.005
     delta = 0.001
     settling_time = 0.4
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.grains not in ("spheres", "stones"):
+            raise ValueError(f"grains {self.grains}: allowed are spheres and stones")
+
     def build(self) -> Scene:
         """The scene, with the large bodies "tray" and "bucket"."""
         scene = Scene(self.friction)
-        x, y, z = ((np.arange(count) - (count - 1) / 2) * 2.4 * RADIUS for count in (20, 8, 6))
-        scene.add_spheres(perturbed(x, y, z - z[0] + 1.5 * RADIUS, 0.1 * RADIUS, 1), RADIUS, 2500.0)
+        layers = 9 if self.grains == "stones" else 6
+        x, y, z = ((np.arange(count) - (count - 1) / 2) * 2.4 * RADIUS for count in (20, 8, layers))
+        places = perturbed(x, y, z - z[0] + 1.5 * RADIUS, 0.1 * RADIUS, 1)
+        if self.grains == "stones":
+            rng = np.random.default_rng(1)
+            corners = rng.normal(size=(14, 3))
+            corners *= 1.2 * RADIUS * np.array([1.0, 0.85, 0.7]) / np.linalg.norm(corners, axis=1)[:, None]
+            turns, scale = rng.normal(size=(len(places), 4)), rng.uniform(0.7, 1.0, len(places))
+            scene.add_polyhedra(places, corners, 2500.0, scale=scale, quaternions=turns)
+        else:
+            scene.add_spheres(places, RADIUS, 2500.0)
         walls = [Plane((0, 0, 1))]
         walls += [Plane((-side, 0, 0), (side * 0.1, 0, 0)) for side in (-1, 1)]
         walls += [Plane((0, -side, 0), (0, side * 0.042, 0)) for side in (-1, 1)]
@@ -49,7 +64,7 @@ class Bucket(Experiment):
         return scene
 
     def record(self, step):
-        """The mass of the spheres above the tray, and the torque that the arm bears."""
+        """The mass of the grains above the tray, and the torque that the arm bears."""
         grains = step.world.grains
         lifted = step.total(grains.mass[grains.position[:, 2] > ARM])
         return {"lifted [kg]": lifted, "arm_torque [N m]": -step.force_on("bucket")[4]}

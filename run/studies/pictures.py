@@ -42,7 +42,7 @@ PICTURES = {
 }
 # the step that is drawn of an example with a film
 STEPS = {
-    "drum": 240, "hopper": 120, "incline": 60, "blade": 160, "bucket": 260, "conveyor": 200, "feeder": 1500,
+    "drum": 240, "hopper": 120, "incline": 60, "blade": 160, "bucket": 1140, "conveyor": 200, "feeder": 1500,
     "vibrated": 1500, "wheel": 1000, "ballast": 1600, "dig": 400,
 }  # fmt: skip
 

@@ -73,6 +73,25 @@ def test_a_box_on_a_flat_mesh_touches_as_on_a_plane(angle):
     assert len(np.unique(code)) == len(code)
 
 
+def test_a_box_over_triangles_whose_corners_meet_the_side_of_another():
+    """One whole edge and two of its parts, a triangle without area, and one that is there twice."""
+    vertices = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), (0, -1, 0), (0, 0.2, 0), (0, 1, 0), (0.5, 0, 0)]
+    halves = [(0, 4, 6), (0, 6, 3), (4, 1, 5), (1, 2, 5), (5, 2, 6), (4, 5, 6), (5, 2, 6), (0, 1, 4)]
+    rng, count = np.random.default_rng(7), 200
+    half, turn = np.tile([0.2, 0.1, 0.1], (count, 1)), turns(rng, count, 1e-4)
+    height = (np.abs(turn[:, 2]) * half).sum(axis=1) + rng.choice([1e-3, 0.0, -1e-4], count)
+    center = np.column_stack([rng.uniform(-0.3, 0.3, (count, 2)), height])
+    found = on(Mesh(vertices, halves), BOX, center, turn, half, 0.02)
+    plane = Planes(np.tile([0.0, 0, 1], (count, 1)), np.zeros((count, 3)))
+    right = polyhedra_planes(boxes(center, turn, half), plane, np.full(count, 0.02))
+    np.testing.assert_allclose(least(found, count), least(right, count), atol=1e-9)
+    np.testing.assert_allclose(found.touch.normal, np.tile([0, 0, -1.0], (len(found.pair), 1)), atol=5e-3)
+    corners = np.round(np.column_stack([right.pair, right.touch.point]), 6).tolist()
+    assert {tuple(row) for row in corners} <= {
+        tuple(row) for row in np.round(np.column_stack([found.pair, found.touch.point]), 6).tolist()
+    }
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 0.05, 2.0])
 def test_boxes_are_as_far_from_a_block_of_triangles_as_from_a_box(angle):
     """Over its top, its rims and its corners. What is beside an edge by less than its skin may differ by that."""
@@ -151,9 +170,18 @@ def slid(floor, add):
     ids=["box", "polyhedron", "cylinder"],
 )
 def test_what_slides_over_the_edges_of_a_flat_mesh_goes_on_as_on_a_plane(add):
-    mesh, plane = slid(sheet(12, 4.0, np.random.default_rng(4)), add), slid(Plane((0, 0, 1)), add)
-    np.testing.assert_allclose(mesh[0], plane[0], atol=1e-4)
-    np.testing.assert_allclose(mesh[1], plane[1], atol=1e-4)
+    """Also where the sides of triangles meet corners of others."""
+    plane, rng = slid(Plane((0, 0, 1)), add), np.random.default_rng(4)
+    parts = [sheet(count, 0.8, rng) for count in (3, 5, 4)]
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    strips = Mesh(
+        np.concatenate([part.vertices + [0.8 * k - 1.0, 0, 0] for k, part in enumerate(parts)]),
+        np.concatenate([part.triangles + first for part, first in zip(parts, starts)]),
+    )
+    for floor in (sheet(12, 4.0, rng), strips):
+        mesh = slid(floor, add)
+        np.testing.assert_allclose(mesh[0], plane[0], atol=1e-4)
+        np.testing.assert_allclose(mesh[1], plane[1], atol=1e-4)
     assert abs(plane[0][0, 0] + 1.0) > 0.2
 
 
