@@ -1,4 +1,4 @@
-"""Narrow phase of surfaces made of triangles.
+"""Narrow phase of balls, capsules and half spaces with surfaces made of triangles; solids are in `solid_meshes`.
 
 The contacts of a ball are the places of the surface where the distance from its centre is least among the places
 around them: over a face, on an edge or at a vertex, each once, however many triangles share it (Ericson 2005,
@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
-from dem.contact.convex import CLOSEST, Solids, needles, solids_planes, solids_solids
 from dem.contact.narrow import (
     Capsules,
     Manifold,
@@ -25,10 +24,8 @@ from dem.contact.narrow import (
     end_ball,
     reversed_touch,
 )
-from dem.contact.polyhedra import TIE, Hulls
-from dem.contact.simplex import ROUND, SNAP
 from dem.mesh import Closest, Surface, spread
-from dem.quaternion import cross, length
+from dem.quaternion import length
 
 #: Sine of the angle by which a direction may leave those in which an edge or a vertex is closest, for rounding.
 ROUNDING = 1e-6
@@ -39,9 +36,6 @@ ROCKING = 0.1
 #: Features of a capsule on a surface: those of the surface for each end ball, and for the core between.
 PARTS = 3
 
-#: Features of other shapes on a surface: those of the surface for each name of a contact, and once more.
-NAMES = CLOSEST + 2
-
 
 class PlacedMesh(NamedTuple):
     """One surface in the world."""
@@ -51,7 +45,7 @@ class PlacedMesh(NamedTuple):
     turn: Floats  #: (3, 3) its frame
 
 
-class _SurfaceContacts(NamedTuple):
+class SurfaceContacts(NamedTuple):
     """Contacts of bodies and one surface, in its frame."""
 
     row: Ints  #: (k,) of the body
@@ -60,9 +54,9 @@ class _SurfaceContacts(NamedTuple):
     away: Floats  #: (k, 3) unit vector from there to the body
     gap: Floats  #: (k,) [m]
 
-    def take(self, rows: Ints | Bools) -> _SurfaceContacts:
+    def take(self, rows: Ints | Bools) -> SurfaceContacts:
         columns: Any = self
-        return _SurfaceContacts(*(column[rows] for column in columns))
+        return SurfaceContacts(*(column[rows] for column in columns))
 
     def manifold(self, mesh: PlacedMesh) -> Manifold:
         """The same in the world."""
@@ -94,141 +88,11 @@ def capsule_mesh(capsule: Capsules, mesh: PlacedMesh, delta: Floats) -> Manifold
     row, triangle = surface.near(core.center, core.half_length + reach)
     through = _through_faces(row, triangle, core, surface)
     parts += [_across_edges(row, triangle, core, reach, surface), _over_vertices(row, triangle, core, reach, surface)]
-    found = _SurfaceContacts(*(np.concatenate(columns) for columns in zip(*parts, through)))
+    found = SurfaceContacts(*(np.concatenate(columns) for columns in zip(*parts, through)))
     # The end on the wrong side of a face that the core goes through would be held there; the first is at the start.
     short = (dot(through.away, core.axis[through.row]) < 0.0).astype(np.int64)
     stuck = PARTS * surface.features * through.row + through.feature + (short - 2) * surface.features
     return found.take(~np.isin(PARTS * surface.features * found.row + found.feature, stuck)).manifold(mesh)
-
-
-def solid_mesh(body: Solids, mesh: PlacedMesh, delta: Floats, hulls: Hulls) -> Manifold:
-    """Convex shapes and one surface: corners and supports of the shapes over faces, and edges and vertices of the
-    surface on the shapes."""
-    surface = mesh.surface
-    center, turn = (body.center - mesh.middle) @ mesh.turn, np.ascontiguousarray(mesh.turn.T @ body.turn)
-    body = body._replace(center=center, turn=turn)
-    row, triangle = surface.near(center, body.radius + delta)
-    over = _over_faces(row, triangle, body, delta, hulls, surface)
-    ridges = _on_ridges(row, triangle, body, delta, hulls, surface)
-    found = _SurfaceContacts(*(np.concatenate(columns) for columns in zip(over, ridges)))
-    return found.take(_distinct(found, body, surface)).manifold(mesh)
-
-
-def _over_faces(
-    row: Ints, triangle: Ints, body: Solids, delta: Floats, hulls: Hulls, surface: Surface
-) -> _SurfaceContacts:
-    """Where corners and supports of shapes are over faces, or have gone through them from the side of the centre."""
-    normal, origin, center = surface.normal[triangle], surface.corner[triangle, 0], body.center[row]
-    outward = np.copysign(1.0, dot(center - origin, normal))[:, None] * normal
-    pair, name, touch = solids_planes(body.take(row), Planes(outward, origin), delta[row], hulls)
-    row, triangle, outward, center, gap = row[pair], triangle[pair], outward[pair], center[pair], touch.gap
-    foot = touch.point - 0.5 * gap[:, None] * outward
-    deep = np.flatnonzero(gap < 0.0)  # the way from the centre must go through the triangle
-    share = (height := dot((center - foot)[deep], outward[deep])) / (height - gap[deep])
-    way = foot.copy()
-    way[deep] = center[deep] + share[:, None] * (foot + gap[:, None] * outward - center)[deep]
-    found = _SurfaceContacts(row, triangle + name * surface.features, foot, outward, gap)
-    return found.take(_within_sides(row, triangle, outward, surface.over(way, triangle), body, hulls, surface))
-
-
-def _within_sides(
-    row: Ints, triangle: Ints, outward: Floats, inside: Floats, body: Solids, hulls: Hulls, surface: Surface
-) -> Bools:
-    """Which of the places on triangles, on the side `outward` (k, 3), that are inside of their sides by `inside` (k, 3)
-    [m] are contacts.
-
-    In a groove a body may have gone through both sides. What is behind a ridge, as seen from the body, is hidden.
-    Beyond a ridge are corners of bodies that lie on it: without their skin they may be over the face, so that the ridge
-    has no contact."""
-    beyond, turn, back = (column[triangle] for column in surface.beyond)
-    thick, up = body.thick[row, None], turn * np.sign(dot(outward, surface.normal[triangle]))[:, None]
-    height = dot(body.center[row, None] - surface.corner[beyond, 0], surface.normal[beyond])
-    hidden = (up > 0.0) & (back * height <= 0.0)
-    within = inside >= -thick * np.select([hidden, up > 0.0], [-ROUND, ROUND], TIE)
-    edged = (up < 0.0) & (body.rounding[row, None] == 0.0) & ~within & (inside >= -2.0 * ROUND * thick)
-    n, k = np.nonzero(edged & (within | edged).all(axis=1)[:, None])
-    start, end = surface.corner[triangle[n], k], surface.corner[triangle[n], (k + 1) % 3]
-    inward = cross(surface.normal[triangle[n]], end - start)
-    side = Planes(-inward / length(inward)[:, None], start)
-    over = np.unique(solids_planes(body.take(row[n]), side, -SNAP * body.thick[row[n]], hulls).pair)
-    within[n[over], k[over]] = True
-    return within.all(axis=1)  # type: ignore[no-any-return]
-
-
-def _on_ridges(
-    row: Ints, triangle: Ints, body: Solids, delta: Floats, hulls: Hulls, surface: Surface
-) -> _SurfaceContacts:
-    """Where edges of the surface, with the vertices at their ends, are closest to shapes, among the surface around
-    them."""
-    near_row, near_triangle = row, triangle
-    row, edge = _each_once(row, surface.side[triangle], surface.ridges)
-    one, two = np.moveaxis(surface.vertex[surface.edge[edge]], 1, 0)
-    size, away = length(two - one), body.center[row] - one
-    along = (two - one) / np.where(size > 0.0, size, 1.0)[:, None]
-    foot = dot(away, along)
-    half = np.sqrt(np.maximum((body.radius + delta)[row] ** 2 - (dot(away, away) - foot**2), 0.0))
-    low, high = np.maximum(foot - half, 0.0), np.minimum(foot + half, size)  # what of it is within reach
-    within = low < high
-    row, edge, one, along, low, high, size = (c[within] for c in (row, edge, one, along, low, high, size))
-    rod = needles(one + low[:, None] * along, one + high[:, None] * along, body.thick[row])
-    pair, name, touch = solids_solids(body.take(row), rod, delta[row], hulls)
-    # Sharp bodies that lie on the edge have no point there that is closer than those of their faces.
-    lies = np.zeros(len(row), bool)
-    lies[pair[name != CLOSEST]] = True
-    keep = (name != CLOSEST) | ~lies[pair] | (body.rounding[row[pair]] > 0.0)
-    pair, name, touch = pair[keep], name[keep], touch.take(keep)
-
-    row, edge, away = row[pair], edge[pair], -touch.normal
-    place = touch.point - 0.5 * touch.gap[:, None] * away
-    t, close = dot(place - one[pair], along[pair]), SNAP * body.thick[row]
-    count = len(surface.triangle)
-    feature, vertex = count + edge, np.full(len(row), -1)
-    for at, end in ((t < close, 0), (t > size[pair] - close, 1)):
-        vertex[at] = surface.edge[edge[at], end]
-    feature = np.where(vertex >= 0, count + len(surface.edge) + vertex, feature)
-    found = _SurfaceContacts(row, feature, place, away, touch.gap)
-    least = _within_cone(surface, feature, place, away, ROCKING)
-    least &= _beside(near_row, near_triangle, found, body.thick, surface)
-    near = np.flatnonzero(least)
-    # An edge has several contacts, a vertex, at which several edges end, one: with a face, if there is one.
-    near = near[np.lexsort((touch.gap[near], name[near] == CLOSEST))]
-    named = feature[near] + (1 + name[near]) * surface.features
-    each = row[near] * (NAMES * surface.features) + np.where(vertex[near] >= 0, feature[near], named)
-    _, first = np.unique(each, return_index=True)
-    return found.take(near)._replace(feature=named).take(first)
-
-
-def _beside(row: Ints, triangle: Ints, found: _SurfaceContacts, thick: Floats, surface: Surface) -> Bools:
-    """Which contacts of edges and vertices are closest, too, among the near triangles (n,) of their rows that they lie
-    in, though these do not have them: as where the corners of one meet the side of another."""
-    loose = np.flatnonzero(surface.loose[found.feature - len(surface.triangle)])
-    start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(thick)))])
-    own, entry = spread(start, found.row[loose])
-    own, other = loose[own], triangle[np.argsort(row, kind="stable")[entry]]
-    meet = surface.closest(found.point[own], other).distance <= 1e-6 * thick[found.row[own]]
-    own, other = own[meet], other[meet]
-    way = surface.corner[other] - found.point[own, None]
-    ahead = dot(way, found.away[own, None]) > ROCKING * length(way) + 1e-6 * thick[found.row[own], None]
-    beside = np.ones(len(found.row), bool)
-    beside[own[ahead.any(axis=1)]] = False
-    return beside
-
-
-def _distinct(found: _SurfaceContacts, body: Solids, surface: Surface) -> Ints:
-    """Which contacts are not within SNAP half thicknesses of one of lesser gap and almost the same direction, nor those
-    of a ridge beside a corner that is over a face: its direction is that of a corner without its skin."""
-    order = np.lexsort((found.feature, found.gap, found.row))
-    start = np.concatenate([[0], np.cumsum(np.bincount(found.row, minlength=len(body.thick)))])
-    one, two = spread(start, found.row[order])
-    one, two, before = order[one], order[two], two < one
-    thick = body.thick[found.row[one]]
-    apart, lower = length(found.point[one] - found.point[two]) / thick, (found.gap[two] - found.gap[one]) / thick
-    same = before & (apart <= SNAP) & (dot(found.away[one], found.away[two]) > 0.99)
-    name, feature = np.divmod(found.feature, surface.features)
-    over = feature < len(surface.triangle)
-    bevel = ~over & (name == 1 + CLOSEST) & (body.rounding[found.row] == 0.0)
-    same |= bevel[one] & over[two] & (apart <= 2.0 * ROUND) & (lower <= ROUND)
-    return np.setdiff1d(order, one[same])
 
 
 def plane_mesh(plane: Planes, mesh: PlacedMesh, delta: Floats) -> Manifold:
@@ -239,7 +103,7 @@ def plane_mesh(plane: Planes, mesh: PlacedMesh, delta: Floats) -> Manifold:
     return Manifold(pair, hull[corner], reversed_touch(touch))
 
 
-def _feet(ball: Spheres, delta: Floats, surface: Surface) -> _SurfaceContacts:
+def _feet(ball: Spheres, delta: Floats, surface: Surface) -> SurfaceContacts:
     """The places of the surface at distances from the centres of balls (m,) that are least around them, with gaps of
     at most `delta` (m,)."""
     center, radius = ball
@@ -251,15 +115,15 @@ def _feet(ball: Spheres, delta: Floats, surface: Surface) -> _SurfaceContacts:
     _, first = np.unique(row * surface.features + found.feature, return_index=True)  # triangles share edges, vertices
     size = found.distance[first, None]
     away = (center[row[first]] - found.point[first]) / np.where(size > 0.0, size, 1.0)  # zero where there is no way
-    within = _within_cone(surface, found.feature[first], found.point[first], away, ROUNDING)
+    within = within_cone(surface, found.feature[first], found.point[first], away, ROUNDING)
     away = np.where(size > 0.0, away, surface.normal[triangle[first]])
     least, away = first[within], away[within]
     chosen = _one_for_each(row, triangle, found, least, radius, surface)
     row, gap = row[least], found.distance[least] - radius[row[least]]
-    return _SurfaceContacts(row, found.feature[least], found.point[least], away, gap).take(chosen)
+    return SurfaceContacts(row, found.feature[least], found.point[least], away, gap).take(chosen)
 
 
-def _within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, slack: float) -> Bools:
+def within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, slack: float) -> Bools:
     """Which points (k, 3) of features (k,) are closest, among those of the surface around them, to what is in the
     direction `away` (k, 3) from them; always those over faces."""
     inside = np.ones(len(feature), dtype=bool)
@@ -304,15 +168,15 @@ def _one_for_each(row: Ints, triangle: Ints, found: Closest, least: Ints, radius
     return np.flatnonzero(~dropped)
 
 
-def _each_once(row: Ints, items: Ints, wanted: Bools) -> tuple[Ints, Ints]:
+def each_once(row: Ints, items: Ints, wanted: Bools) -> tuple[Ints, Ints]:
     """The distinct pairs of rows (k,) and of those of the three items (k, 3) of their triangles that are wanted."""
     return np.divmod(np.unique((row[:, None] * len(wanted) + items)[wanted[items]]), len(wanted))  # type: ignore
 
 
-def _across_edges(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> _SurfaceContacts:
+def _across_edges(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> SurfaceContacts:
     """Where cores pass over edges, each between its ends."""
     center, axis, half_length, radius = core
-    row, edge = _each_once(row, surface.side[triangle], surface.ridges)
+    row, edge = each_once(row, surface.side[triangle], surface.ridges)
     start, end = surface.vertex[surface.edge[edge, 0]], surface.vertex[surface.edge[edge, 1]]
     size = length(end - start)
     along = (end - start) / size[:, None]
@@ -322,11 +186,11 @@ def _across_edges(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surf
     return _from_core(row[over], feature, point, s[over], ROCKING, core, reach, surface)
 
 
-def _over_vertices(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> _SurfaceContacts:
+def _over_vertices(row: Ints, triangle: Ints, core: Capsules, reach: Floats, surface: Surface) -> SurfaceContacts:
     """Vertices that are beside cores, between their ends."""
     sharp = np.zeros(len(surface.vertex), dtype=bool)
     sharp[surface.edge[surface.ridges]] = True
-    row, vertex = _each_once(row, surface.triangle[triangle], sharp)
+    row, vertex = each_once(row, surface.triangle[triangle], sharp)
     point = surface.vertex[vertex]
     s = dot(point - core.center[row], core.axis[row])
     beside = np.abs(s) < core.half_length[row]
@@ -336,18 +200,18 @@ def _over_vertices(row: Ints, triangle: Ints, core: Capsules, reach: Floats, sur
 
 def _from_core(
     row: Ints, feature: Ints, point: Floats, s: Floats, slack: float, core: Capsules, reach: Floats, surface: Surface
-) -> _SurfaceContacts:
+) -> SurfaceContacts:
     """The contacts of points of edges and vertices with the places `s` [m] of the cores, where these are closest."""
     center, axis, _, radius = core
     away = center[row] + s[:, None] * axis[row] - point
     distance = length(away)
     away = away / np.where(distance > 0.0, distance, 1.0)[:, None]
-    found = _SurfaceContacts(row, feature + 2 * surface.features, point, away, distance - radius[row])
+    found = SurfaceContacts(row, feature + 2 * surface.features, point, away, distance - radius[row])
     near = np.flatnonzero((distance > 0.0) & (distance <= reach[row]))
-    return found.take(near[_within_cone(surface, feature[near], point[near], away[near], slack)])
+    return found.take(near[within_cone(surface, feature[near], point[near], away[near], slack)])
 
 
-def _through_faces(row: Ints, triangle: Ints, core: Capsules, surface: Surface) -> _SurfaceContacts:
+def _through_faces(row: Ints, triangle: Ints, core: Capsules, surface: Surface) -> SurfaceContacts:
     """Where cores go through faces."""
     center, axis, half_length, radius = core
     normal, corner = surface.normal[triangle], surface.corner[triangle]
@@ -358,4 +222,4 @@ def _through_faces(row: Ints, triangle: Ints, core: Capsules, surface: Surface) 
     in_face = surface.closest(point, triangle).feature == triangle
     gap = np.abs(height) - np.abs(slope) - radius[row]
     away = np.copysign(1.0, height)[:, None] * normal
-    return _SurfaceContacts(row, triangle + 2 * surface.features, point, away, gap).take(in_face)
+    return SurfaceContacts(row, triangle + 2 * surface.features, point, away, gap).take(in_face)

@@ -1,7 +1,8 @@
 """Narrow phase of capsules and half spaces, and what that of polyhedra and of meshes shares with it.
 
 Each function takes m pairs of a first and a second shape, and returns a `Touch` if they touch in one point, else a
-`Manifold`. Spheres are in `spheres`, polyhedra in `polyhedra`, surfaces of triangles in `meshes`.
+`Manifold`. Spheres are in `spheres`, polyhedra in `polyhedra`, surfaces of triangles in `meshes`
+and `solid_meshes`.
 
 Capsules touch at the ends of what lies side by side, and at the closest point between them; docs/mechanics.md says why.
 """

@@ -14,7 +14,7 @@ from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPH
 from dem.contact.ahead import Course, Forms, Poses, hosts_first, seen_from, turn_ahead
 from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.convex import Solids, Supports, arcs_of, solids, solids_planes, solids_solids, supports_of
-from dem.contact.meshes import NAMES, PlacedMesh, capsule_mesh, plane_mesh, solid_mesh, sphere_mesh
+from dem.contact.meshes import PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
 from dem.contact.narrow import (
     Boxes,
     Capsules,
@@ -37,6 +37,7 @@ from dem.contact.polyhedra import (
     polyhedra_polyhedra,
     spheres_polyhedra,
 )
+from dem.contact.solid_meshes import NAMES, solid_mesh
 from dem.contact.spheres import touch_spheres
 from dem.mesh import Mesh, Surface
 from dem.motion import Dynamic

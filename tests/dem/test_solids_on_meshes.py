@@ -12,9 +12,10 @@ from dem import quaternion
 from dem.bodies import BOX, CONVEX
 from dem.contact import find_contacts
 from dem.contact.convex import solids, solids_planes, supports_of
-from dem.contact.meshes import PlacedMesh, solid_mesh
+from dem.contact.meshes import PlacedMesh
 from dem.contact.narrow import Planes
 from dem.contact.polyhedra import Polyhedra, hulls_of, polyhedra_planes, polyhedra_polyhedra
+from dem.contact.solid_meshes import solid_mesh
 from dem.mesh import Mesh
 from dem.motion import Dynamic, Rotation
 from dem.scene import Scene
