@@ -468,8 +468,8 @@ def write_page(sizes: list[list[Row]], about: Row) -> None:
 
 PAGE, HEAD = shared.ROOT / "docs" / "measurements.md", "## Beside LIGGGHTS\n"
 TEXT = """`run/study compare_liggghts` writes this section. [LIGGGHTS](https://www.cfdem.com) 3.8.0 (`apt-get install
-liggghts`) is a soft-sphere code; both codes stir the same settled beds, on one core of an {cpu} whose
-other core is idle, commit {commit}.
+liggghts`) is a soft-sphere code; both codes stir the same settled beds, on one core of an {cpu}, commit
+{commit}. Trust the ratios: cores of this name differ by a factor of 2.5.
 
 {table}
 
