@@ -142,14 +142,13 @@ class ContactMap:
     def find_image(self, x: Floats, image: Floats) -> None:
         """image = D x for impulses x (nc, 3)."""
         count = self.halo.rows
-        self._collect(x, image[:count])
+        self._push(x, image[:count])
         self.mass.share(image[:count], self._pushed, image[count:])
         self.log_flops(self._flops)
 
     def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats) -> None:
         """y = before + G G' z (nc, 3) for the z whose image is image + beta (image - last)."""
-        count = self.halo.rows
-        shared = image[count:] + self.precision(beta) * (image[count:] - last[count:])
+        shared = self._shared_at(image, last, beta)
         loops.scale_extrapolated(self.mass.unshared, image, last, beta, self._w)
         self._send(shared)
         self._set_velocities(before, y, self.mass.rates(shared))
@@ -157,9 +156,15 @@ class ContactMap:
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
         """d'GG'd of this rank's bodies, for the step d that leads from this z to the x with the image ``new``."""
-        first, energy = self.halo.rows, loops.energy_of_step(self.mass.unshared, new, image, last, beta)
-        shared = image[first:]
-        return energy + self.mass.energy(new[first:] - shared - self.precision(beta) * (shared - last[first:]))
+        energy: float = loops.energy_of_step(self.mass.unshared, new, image, last, beta)
+        if self.mass.shared:
+            energy += self.mass.energy(new[self.halo.rows :] - self._shared_at(image, last, beta))
+        return energy
+
+    def _shared_at(self, image: Floats, last: Floats, beta: float) -> Floats:
+        """The shared coordinates (mass.shared, 6) of z."""
+        now, before = image[self.halo.rows :], last[self.halo.rows :]
+        return now + self.precision(beta) * (now - before) if self.mass.shared else now
 
     def weights(self, H: Floats, symmetric: bool = True) -> Floats:
         """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
@@ -244,7 +249,10 @@ class ContactMap:
 
     def _collect(self, g: Floats, m: Floats) -> None:
         """m = the momenta that impulses give to the bodies, not yet scaled by masses; and what they push of a cell."""
-        g = self._floats(shaped("impulses", g, self.rows, 3))
+        self._push(self._floats(shaped("impulses", g, self.rows, 3)), m)
+
+    def _push(self, g: Floats, m: Floats) -> None:
+        """The same of impulses (nc, 3) that have the precision of the map."""
         self._pushed[:] = 0.0
         if threads() > 1:
             loops.find_forces(self._arrays[0], g, self._forces)

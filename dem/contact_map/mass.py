@@ -36,12 +36,14 @@ class InverseMass:
         self.precision = precision
         self.root, self.square = (np.ascontiguousarray(x, dtype=precision) for x in (root, squared(root)))
         self.unshared = self.square  #: M^-1 of the bodies that are in no shared coordinate, else zero
+        self._none = np.zeros(0, precision)
 
     def rounded(self: Mass, precision: type[np.floating]) -> Mass:
         """The same in this precision."""
         other = copy.copy(self)
         tables = (np.ascontiguousarray(x, dtype=precision) for x in (self.root, self.square, self.unshared))
         other.precision, (other.root, other.square, other.unshared) = precision, tables
+        other._none = np.zeros(0, precision)
         return other
 
     def scale(self, v: Floats, out: Floats) -> None:
@@ -63,16 +65,16 @@ class InverseMass:
 
     def rates(self, s: Floats) -> Floats:
         """The rates (axes,) of a cell by s."""
-        return np.zeros(0, self.precision)
+        return self._none
 
     def rates_of(self, v: Floats) -> Floats:
         """The rates (axes,) of mass-scaled velocities v (columns, 6); collective."""
-        return np.zeros(0, self.precision)
+        return self._none
 
     @property
     def mobility(self) -> Floats:
         """That of the rates (axes,)."""
-        return np.zeros(0, self.precision)
+        return self._none
 
     def energy(self, s: Floats) -> float:
         """s' M^-1 s, on one rank."""

@@ -14,7 +14,7 @@ from dem.arrays import Floats, Ints
 from dem.compiled import loop
 from dem.contact_map import loops
 from dem.contact_map.halo import Halo
-from dem.contact_map.map import ContactMap, shaped
+from dem.contact_map.map import ContactMap
 from dem.contact_map.mass import InverseMass
 from dem.contact_map.rows import BlockRows, CompactRows, root_blocks
 
@@ -64,8 +64,8 @@ class TurningMap(ContactMap):
         super()._set_velocities(before[:n], y[:n], rate)
         set_turning(self._turn, self.body, before[n:], y[n:], self._w)
 
-    def _collect(self, g: Floats, m: Floats) -> None:
-        g, n = self._floats(shaped("impulses", g, self.rows, 3)), self.contacts
+    def _push(self, g: Floats, m: Floats) -> None:
+        n = self.contacts
         m[:], self._pushed[:] = 0.0, 0.0
         for part in self._away:
             self._add_impulses(part, g[:n], g[n:], m)

@@ -92,7 +92,7 @@ class Sample:
 
 def stepped(x, last_x, y, compliance, beta, step, mu, opening):
     out = np.zeros_like(x)
-    return *cone.accelerated_step(x, last_x, y, compliance, beta, step, mu, opening, out).sum(axis=0), out
+    return *cone.accelerated_step(x, last_x, y, compliance, beta, step, mu, opening, out), out
 
 
 def summed(*arguments):

@@ -118,13 +118,13 @@ def _add_works(x, y, r, count, squares, closings, openings, energies, most):
 def accelerated_step(
     x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, mu: Array, de_saxce: float,
     out: Array,
-) -> Array:  # fmt: skip
+) -> tuple[float, float, float]:  # fmt: skip
     """P(z - step y_z) for z = x + beta (x - last_x) and its gradient y_z = y + C z, to which the term (mu |y_t|, 0, 0)
     of De Saxce is added once (``de_saxce`` 1: Coulomb's law) or not (0). ``compliance`` has the diagonal of C (nc, 3),
     or no row for C = 0.
 
-    Returned are, for each part of the contacts of this rank (parts, 3), d'Cd and |d|^2 of d = out - z, and
-    y_z'(out - x); z and y_z are nowhere stored. A contact moves 64 bytes in single precision, 52 without compliance."""
+    Returned are, for the contacts of this rank, d'Cd and |d|^2 of d = out - z, and y_z'(out - x), sums of parts; z and
+    y_z are nowhere stored. A contact moves 64 bytes in single precision, 52 without compliance."""
     part, step_length, soft, count = x.dtype.type(beta), x.dtype.type(step), len(compliance) > 0, len(mu)
     x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
     sums = np.zeros(((count + PART - 1) // PART, 3))
@@ -148,7 +148,10 @@ def accelerated_step(
             if soft:
                 add_work(to[a:b], z, compliance[a:b], work)
         sums[k] = work.sum(), squares.sum(), products.sum()
-    return sums
+    total_work, square, product = 0.0, 0.0, 0.0
+    for k in range(len(sums)):
+        total_work, square, product = total_work + sums[k, 0], square + sums[k, 1], product + sums[k, 2]
+    return total_work, square, product
 
 
 @loop
@@ -292,9 +295,7 @@ class FrictionCones(Cones):
     def accelerated_step(
         self, x: Array, last_x: Array, y: Array, compliance: Array, beta: float, step: float, coulomb: bool, out: Array
     ) -> tuple[float, float, float]:
-        sums = accelerated_step(x, last_x, y, compliance, beta, step, self.mu, float(coulomb), out)
-        work, square, product = sums.sum(axis=0)
-        return work, square, product
+        return accelerated_step(x, last_x, y, compliance, beta, step, self.mu, float(coulomb), out)
 
     def errors(
         self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None

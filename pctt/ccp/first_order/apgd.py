@@ -103,7 +103,7 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
         if uphill > 0 or (coulomb and step > options.growth * least):
             theta, beta, least = options.theta, 0.0, np.inf
         else:
-            last_theta, theta = theta, theta * (np.sqrt(theta**2 + 4) - theta) / 2
+            last_theta, theta = theta, theta * (math.sqrt(theta**2 + 4) - theta) / 2
             beta, least = last_theta * (1 - last_theta) / (last_theta**2 + theta), min(least, step)
             if coulomb:
                 beta = min(beta, 1 - (options.near if progress.best < NEAR else options.damping))
