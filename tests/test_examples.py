@@ -154,7 +154,7 @@ def test_the_bucket_is_a_scene_with_a_tool_from_a_file(tmp_path, monkeypatch):
     _, records = run("bucket", 2, scene_file=str(tmp_path / "bucket.stl"))
     assert records["lifted [kg]"].tolist() == [0.0, 0.0]
     _, records = run("bucket", 2, scene_file=str(tmp_path / "bucket.stl"), scene_grains="stones")
-    assert records["lifted [kg]"].tolist() == [0.0, 0.0]
+    assert 0 < records["lifted [kg]"][0] < 1  # the uppermost layers, before they settle
     with pytest.raises(ValueError, match="grains cubes: allowed are spheres and stones"):
         from_file(EXAMPLES / "bucket.py")(grains="cubes")
 
