@@ -119,7 +119,7 @@ class Surface:
         other[one], other[two] = two, one
         opposite = np.roll(self.corner, 1, axis=1).reshape(-1, 3)
         away = opposite[other] - self.corner[face, 0]
-        sine = np.einsum("ki,ki->k", away, self.normal[face]) / length(self.half)
+        sine = np.einsum("ki,ki->k", away, self.normal[face]) / np.maximum(length(away), 1e-300)
         turn = np.where((other < 0) | (np.abs(sine) < 1e-9), 0.0, np.sign(sine)).astype(np.int64)
         return face[other].reshape(-1, 3), turn.reshape(-1, 3), turn[other].reshape(-1, 3)
 
