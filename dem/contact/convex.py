@@ -138,10 +138,10 @@ def solids(kind: Ints, center: Floats, turn: Floats, size: Floats, hulls: Hulls,
 
 
 def needles(start: Floats, end: Floats, thick: Floats) -> Solids:
-    """Segments from places (m, 3) to others [m], to be beside bodies of these half thicknesses (m,)."""
+    """Segments from places (m, 3) to other ones [m], to be beside bodies of these half thicknesses (m,)."""
     many, axis, numbers = len(start), 0.5 * (end - start), np.zeros((len(start), 6))
     half = length(axis)
-    along = axis / np.where(half > 0.0, half, 1.0)[:, None]
+    along = axis / half[:, None]
     one = across(along)
     turn, numbers[:, 1] = np.stack([one, cross(along, one), along], axis=2), half
     none, skin = np.zeros(many, np.int64), np.full(many, 1e-300)  # with none it would be given that of sharp edges

@@ -49,7 +49,7 @@ class SurfaceContacts(NamedTuple):
     """Contacts of bodies and one surface, in its frame."""
 
     row: Ints  #: (k,) of the body
-    feature: Ints  #: (k,) of the surface, and more than all these for each part of a capsule before
+    feature: Ints  #: (k,) of the surface, and more than all these for each part of a capsule, or name, before
     point: Floats  #: (k, 3) of the surface [m]
     away: Floats  #: (k, 3) unit vector from there to the body
     gap: Floats  #: (k,) [m]

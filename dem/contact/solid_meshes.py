@@ -51,29 +51,31 @@ def _over_faces(
     way = foot.copy()
     way[deep] = center[deep] + share[:, None] * (foot + gap[:, None] * outward - center)[deep]
     found = SurfaceContacts(row, triangle + name * surface.features, foot, outward, gap)
-    return found.take(_within_sides(row, triangle, outward, surface.over(way, triangle), body, hulls, surface))
+    return found.take(_within_sides(found, triangle, surface.over(way, triangle), body, hulls, surface))
 
 
 def _within_sides(
-    row: Ints, triangle: Ints, outward: Floats, inside: Floats, body: Solids, hulls: Hulls, surface: Surface
+    found: SurfaceContacts, triangle: Ints, inside: Floats, body: Solids, hulls: Hulls, surface: Surface
 ) -> Bools:
-    """Which of the places on triangles, on the side `outward` (k, 3), that are inside of their sides by `inside` (k, 3)
-    [m] are contacts.
+    """Which of the places on triangles (k,), inside of their sides by `inside` (k, 3) [m], are contacts.
 
     In a groove a body may have gone through both sides. What is behind a ridge, as seen from the body, is hidden.
-    Beyond a ridge are corners of bodies that lie on it: without their skin they may be over the face, so that the ridge
-    has no contact."""
+    Beyond a ridge are corners of bodies that lie on it, further than they have gone through: without their skin they
+    may be over the face, so that the ridge has no contact. What is deeper than the skin has one."""
+    row, outward = found.row, found.away
     beyond, turn, back = (column[triangle] for column in surface.beyond)
     thick, up = body.thick[row, None], turn * np.sign(dot(outward, surface.normal[triangle]))[:, None]
     height = dot(body.center[row, None] - surface.corner[beyond, 0], surface.normal[beyond])
     hidden = (up > 0.0) & (back * height <= 0.0)
     within = inside >= -thick * np.select([hidden, up > 0.0], [-ROUND, ROUND], TIE)
-    edged = (up < 0.0) & (body.rounding[row, None] == 0.0) & ~within & (inside >= -2.0 * ROUND * thick)
+    shallow = (body.rounding[row, None] == 0.0) & (found.gap[:, None] >= -ROUND * thick)
+    edged = (up < 0.0) & shallow & ~within & (inside >= -2.0 * ROUND * thick)
     n, k = np.nonzero(edged & (within | edged).all(axis=1)[:, None])
     start, end = surface.corner[triangle[n], k], surface.corner[triangle[n], (k + 1) % 3]
     inward = cross(surface.normal[triangle[n]], end - start)
     side = Planes(-inward / length(inward)[:, None], start)
-    over = np.unique(solids_planes(body.take(row[n]), side, -SNAP * body.thick[row[n]], hulls).pair)
+    further = np.maximum(SNAP * body.thick[row[n]], -found.gap[n])
+    over = np.unique(solids_planes(body.take(row[n]), side, -further, hulls).pair)
     within[n[over], k[over]] = True
     return within.all(axis=1)  # type: ignore[no-any-return]
 
@@ -94,7 +96,7 @@ def _on_ridges(
     found = SurfaceContacts(own, _feature_at(place, edge, SNAP * body.thick[own], surface), place, away, touch.gap)
     least = within_cone(surface, found.feature, place, away, ROCKING)
     least &= _beside(row, triangle, found, body.thick, surface)
-    return _named(found, name, least, surface)
+    return _named(found, name, least, body, surface)
 
 
 def _within_reach(
@@ -120,11 +122,12 @@ def _feature_at(place: Floats, edge: Ints, close: Floats, surface: Surface) -> I
     return feature  # type: ignore[no-any-return]
 
 
-def _named(found: SurfaceContacts, name: Ints, least: Bools, surface: Surface) -> SurfaceContacts:
+def _named(found: SurfaceContacts, name: Ints, least: Bools, body: Solids, surface: Surface) -> SurfaceContacts:
     """Those that are the `least` (k,), with features that tell the names: of an edge several, of a vertex, at which
-    several edges end, one, with a face, if there is one."""
+    several edges end, one, of sharp bodies with a face, if there is one."""
     order = np.flatnonzero(least)
-    order = order[np.lexsort((found.gap[order], name[order] == CLOSEST))]
+    last = (name == CLOSEST) & (body.rounding[found.row] == 0.0)
+    order = order[np.lexsort((found.gap[order], last[order]))]
     found, name = found.take(order), name[order]
     named = found.feature + (1 + name) * surface.features
     at_vertex = found.feature >= len(surface.triangle) + len(surface.edge)
@@ -158,9 +161,9 @@ def _distinct(found: SurfaceContacts, body: Solids, surface: Surface) -> Ints:
     one, two, before = order[one], order[two], two < one
     thick = body.thick[found.row[one]]
     apart, lower = length(found.point[one] - found.point[two]) / thick, (found.gap[two] - found.gap[one]) / thick
-    same = before & (apart <= SNAP) & (dot(found.away[one], found.away[two]) > 0.99)
     name, feature = np.divmod(found.feature, surface.features)
     over = feature < len(surface.triangle)
     bevel = ~over & (name == 1 + CLOSEST) & (body.rounding[found.row] == 0.0)
-    same |= bevel[one] & over[two] & (apart <= 2.0 * ROUND) & (lower <= ROUND)
-    return np.setdiff1d(order, one[same])
+    left_out = np.unique(one[bevel[one] & over[two] & (apart <= 2.0 * ROUND) & (lower <= ROUND)])
+    same = before & (apart <= SNAP) & (dot(found.away[one], found.away[two]) > 0.99) & ~np.isin(two, left_out)
+    return np.setdiff1d(order, np.concatenate([left_out, one[same]]))
