@@ -76,12 +76,19 @@ def recommended(scene: Scene) -> float:
     half = bodies.least_half_thickness(grains)
     allowed = OVERLAP * half
     with np.errstate(over="ignore", invalid="ignore"):  # inf: rigid
-        speeds = fastest_grain(scene), fastest_tool(scene)
+        speeds = _fastest_point(scene), fastest_tool(scene)
         thrown, pushed = (grains.mass * (speed / allowed) ** 2 for speed in speeds)
         needed = [_strongest(_load(scene, pressed) / allowed, thrown, pushed, STOPPED**2), pressed.force / allowed]
         needed += [_stopping(*impact, dt, FALLEN * half) for impact in _impacts(scene, pressed, dt)]
         stiffness = max(float(values.max()) for values in needed)
     return float(f"{stiffness:.1e}") if stiffness > 0.0 else np.inf  # the same on processors that round in other ways
+
+
+def _fastest_point(scene: Scene) -> float:
+    """The greatest speed of a point of a grain at time zero [m/s]: tips of what is no sphere turn, too."""
+    grains = scene.expected()
+    tips = bodies.turning(grains) * bodies.bounding_radius(grains)
+    return float((scene.speeds(grains) + tips).max(initial=0.0))
 
 
 def expected_overlap(scene: Scene, stiffness: float, dt: float) -> float:
@@ -90,7 +97,7 @@ def expected_overlap(scene: Scene, stiffness: float, dt: float) -> float:
     if np.isinf(stiffness):
         return 0.0
     grains, pressed = scene.expected(), pressing(scene)
-    speeds = fastest_grain(scene), fastest_tool(scene)
+    speeds = _fastest_point(scene), fastest_tool(scene)
     thrown, pushed = (speed * np.sqrt(grains.mass / stiffness) for speed in speeds)
     half = bodies.least_half_thickness(grains)
     overlaps = [_strongest(_load(scene, pressed) / stiffness, thrown, pushed, STOPPED)]

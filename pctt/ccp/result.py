@@ -193,7 +193,7 @@ class Result:
             "residual": f"{self.residual:.2e}",
         }
         if (found := self.accuracy) is not None:
-            natural = found.natural_residual if self.law == RELAXATION else found.coulomb_residual
+            natural = self.residual_of(found)
             name = "natural" if self.law == RELAXATION else "Coulomb"
             works = f"closing work {found.closing_work:.1e}, opening work {found.opening_work:.1e}"
             rows["residual"] += f" ({name} {natural:.1e}, {works})"
@@ -209,6 +209,10 @@ class Result:
     def final(self) -> bool:
         """Whether no other solver would do better."""
         return self.status in (Status.CONVERGED, Status.SQUEEZED, Status.UNBOUNDED)
+
+    def residual_of(self, found: Accuracy) -> float:
+        """The residual that the law of the result stands for."""
+        return found.natural_residual if self.law == RELAXATION else found.coulomb_residual
 
     def after(self, *earlier: Result) -> Result:
         """This result, with what the results before it have cost."""

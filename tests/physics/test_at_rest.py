@@ -198,6 +198,25 @@ def test_what_moves_is_solved_to_the_limits_alone():
         assert limits.aim == 1.0
 
 
+def test_impulses_of_an_island_that_spoil_the_whole_are_left_out(monkeypatch):
+    """The residual is relative: with smaller impulses of the island that of the others may be above the tolerance."""
+    given, spoilt = rest.with_part, []
+
+    def halved(problem, result, rows, part):
+        part.impulse *= 0.5
+        whole = given(problem, result, rows, part)
+        spoilt.append(whole.accuracy.coulomb_residual)
+        return whole
+
+    monkeypatch.setattr(rest, "with_part", halved)
+    sim = pctt.Simulation(beside("roller"))
+    for _ in range(60):
+        sim.step()
+        assert sim.figures["converged"]
+        assert sim.figures["coulomb_residual"] <= sim.settings.tol
+    assert max(spoilt) > 10 * sim.settings.tol
+
+
 def test_the_order_of_elimination_is_kept_where_a_part_is_solved_by_itself(monkeypatch):
     scene = tower(2000.0, 2000.0, 2000.0)
     scene.add_spheres([[-1, 0, 0.1]], 0.1, 2500.0, velocity=(-2.0, 0, 0), angular_velocity=(0, -20.0, 0))
