@@ -23,7 +23,7 @@ LineSearch = Callable[[float, float], float]
 
 @dataclass(frozen=True)
 class BarzilaiBorwein(FirstOrder):
-    """Options ``-ccp_barzilai_borwein_*`` and ``-ccp_spectral_*``."""
+    """The numbers of `barzilai_borwein` and `spectral`, set from Python."""
 
     window: int = number(10, "objectives that the line search compares with; Dai and Fletcher's L, Birgin's M")
 
