@@ -52,11 +52,12 @@ from pctt.petsc import warn
 from pctt.render import Picture, picture
 from pctt.run import report, state
 from pctt.run.dump import Dump
+from pctt.run.interrupt import uninterrupted
 from pctt.run.joints import JointNow
 from pctt.run.output import Place, Writer, described_bodies, described_forms, refuse_unwritable
 from pctt.run.overlaps import OverlapWatch
 from pctt.run.settings import Run, Settings, scene_name
-from pctt.run.stepper import NoSolutionError, Stepper
+from pctt.run.stepper import NewStep, NoSolutionError, Stepper
 
 
 class Simulation:
@@ -195,19 +196,32 @@ class Simulation:
         again, but `last` is None."""
         if self._closed:
             raise ValueError("this simulation is closed")
-        stepper, output, self.last = self.stepper, self.output, None  # frees the arrays of the last step
+        self.last = None  # frees the arrays of the last step
         try:
-            made = stepper.step()
+            made = self.stepper.step()
         except NoSolutionError:
-            if output:
-                output.keep()
+            if self.output:
+                self.output.keep()
             raise
         except KeyboardInterrupt:
             self.world.lists = None  # those of the search may be half made
             raise
+        self._take(made)
+        if self.figures["energy_jump"] and not self._jumped:
+            self._jumped = True
+            warn(self.comm, report.jump_words(self.figures, self._program))
+        if cause := self.overlap_watch.look(made.step, self.figures["closing_speed"]):
+            warn(self.comm, self.overlap_watch.words(cause, self.steps, self._program))
+        self._tell_turns()
+        return self.figures
+
+    @uninterrupted()
+    def _take(self, made: NewStep) -> None:
+        """Let the state be that at the end of this step, and write it."""
+        output = self.output
         with log.phase("output"):
             row = recording.row(made.step, self.experiment)
-            stepper.take(made)
+            self.stepper.take(made)
             self.last, self._row, figures = made.step, row, made.figures
             figures["worst_overlap"] = self._row["worst_overlap [m]"]
             figures["energy_jump"] = self._row["energy_jump [J]"]
@@ -220,13 +234,6 @@ class Simulation:
             with log.phase("output"):
                 output.add(figures, self._row)
         self.figures = self._row | figures
-        if figures["energy_jump"] and not self._jumped:
-            self._jumped = True
-            warn(self.comm, report.jump_words(self.figures, self._program))
-        if cause := self.overlap_watch.look(self.last, figures["closing_speed"]):
-            warn(self.comm, self.overlap_watch.words(cause, self.steps, self._program))
-        self._tell_turns()
-        return self.figures
 
     def _tell_turns(self) -> None:
         """Warn of a body that turns too far in a step; collective."""
@@ -252,11 +259,11 @@ class Simulation:
         if until is steps is stop is None:
             raise OptionError("run: without an end; allowed are until, steps and stop")
         refuse_bad(Run(steps=steps or 0))
-        if until is not None and float(until) < self.time - 0.5 * self.settings.dt:
-            raise OptionError(f"run(until={until}): the time is {self.time:g} s already; allowed is a later one")
+        if not isinstance(every, (int, np.integer)) or every < 1:
+            raise OptionError(f"run(every={every}): allowed are whole numbers from 1 on")
         left = math.inf if steps is None else steps
         if until is not None:
-            left = min(left, math.ceil((float(until) - self.time) / self.settings.dt * (1 - 1e-12) - 1e-9))
+            left = min(left, self._steps_until(float(until)))
         first, end, ends = self.steps, self.steps + left, False
         progress_report = report.Progress(self.comm, quiet=not progress)
         progress_report.passed(first, self.time, end)
@@ -274,6 +281,13 @@ class Simulation:
                 ends = self.comm.bcast(together(self.comm, "call or stop of run", tell))
             progress_report.passed(self.steps, self.time, self.steps if ends else end)
         self.complete()
+
+    def _steps_until(self, until: float) -> float:
+        """How many steps lead to this time [s], inf to none."""
+        dt = self.settings.dt
+        if not until >= self.time - 0.5 * dt:
+            raise OptionError(f"run(until={until}): the time is {self.time:g} s already; allowed is a later one")
+        return math.ceil((until - self.time) / dt * (1 - 1e-12) - 1e-9) if until < math.inf else until
 
     # -- what there is ---------------------------------------------------------------------------------------
 
@@ -433,6 +447,7 @@ class Simulation:
 
     # -- files -----------------------------------------------------------------------------------------------
 
+    @uninterrupted()
     def save(self, path: str | Path) -> None:
         """Keep the state in a checkpoint, from which `load` goes on. FileError if that fails."""
         refuse_unwritable("save", Path(path).parent, self.comm)
@@ -441,6 +456,7 @@ class Simulation:
     def _save(self, path: Path) -> None:
         state.save(path, self._origin, self.world, self.memory)
 
+    @uninterrupted()
     def write(
         self,
         folder: str | Path,
@@ -472,11 +488,13 @@ class Simulation:
         self.output = Writer(place, self.world, about, self._save, self._compare.summary, run)
         self.stepper.dump = Dump(self.settings, self.experiment, self.world, place, hard, str(problems))
 
+    @uninterrupted()
     def complete(self) -> None:
         """Write what the folder of `write` lacks of the last step."""
         if self.output and self.last:
             self.output.complete(self.last, self._row)
 
+    @uninterrupted()
     def analyse(self) -> dict[str, float]:
         """The numbers that the scene finds in the records that `write` wrote; they also go to summary.json."""
         if not (self.output and self.last):

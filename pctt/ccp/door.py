@@ -433,7 +433,9 @@ def _masses(comm: MPI.Comm, masses: Any, n: int) -> Array | tuple[Solve, bool]:
         return _by_ksp(comm, masses, n), True
     if isinstance(masses, tuple) and len(masses) == 2:
         wrong = "" if np.shape(masses[0]) == (n, n) else f"masses: a factor of shape {np.shape(masses[0])}"
-        refuse(comm, wrong + f"; allowed is {(n, n)}" if wrong else "")
+        if not wrong and np.ndim(masses[1]):  # the pivots of lu_factor
+            wrong = "masses: the second part of the factor is an array"
+        refuse(comm, wrong + f"; allowed is what scipy.linalg.cho_factor gives of M {(n, n)}" if wrong else "")
         return lambda b: scipy.linalg.cho_solve(masses, b), False
     if not sp.issparse(masses) and (hasattr(masses, "solve") or callable(masses)):
         return _column_by_column(masses.solve if hasattr(masses, "solve") else masses, n), False

@@ -35,7 +35,8 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
     large. If all contacts yield no problem is unbounded. If d'Nd < 0 every problem is.
 
     A heavy body, too, has a small part in G'd: a press on a light grain. So where G is known, the impulses of d must
-    cancel on every body in units of its own mass, see `_left_over`. What joints bear cancels too.
+    cancel on every body in units of its own mass, see `_left_over`. What joints bear cancels too. And where d.N = 0 all
+    velocities are at least -r.d away from the dual cones; so those of a solution, or nearly one, are no sign.
     """
     if problem.all_yield:
         return ""
@@ -48,7 +49,10 @@ def why_unbounded(problem: ConeProblem, g: Array, y: Array | None = None) -> str
     bound = (along / (1e3 * size * speed)) ** 2 if along < 0 < size * speed else 0.0
     if not bound > max(yielding / by_diagonal if by_diagonal > 0 else 0.0, 1e-15):  # a part of d'Nd, and its rounding
         return ""
-    energy = problem.dot(problem.product(g) if y is None else y - problem.r, g) if by_diagonal > 0 else 0.0
+    y = problem.product(g) + problem.r if y is None else y
+    if problem.norm(problem.cones.project(-y, np.empty_like(y))) < -0.5 * along / size:
+        return ""
+    energy = problem.dot(y - problem.r, g) if by_diagonal > 0 else 0.0
     if by_diagonal > 0 and not bound > energy / by_diagonal:
         return ""
     if problem.contact_map is not None and not bound > _left_over(problem, g / size):

@@ -157,7 +157,7 @@ class BlockICC(Context):
     def _factorise(self, values: Array) -> str:
         """Make the factor of this rank's rows; why there is none, or nothing."""
         assert self._layout is not None
-        blocks = values if self._source is None else np.append(values, 0.0)[self._source]
+        blocks = values.reshape(-1, 3, 3) if self._source is None else np.append(values, 0.0)[self._source]
         tau, named = self.options.tau, f"-{self.prefix}{self.options_prefix}"
         automatic = self.options.shift == "auto"
         shift = max(0.5 * tau, self._shift) if automatic else float(self.options.shift)

@@ -24,7 +24,7 @@ from dem.geometry.morton import Frame, morton_codes
 from pctt.blocks import inverse_diagonal_blocks
 from pctt.mat.grid_train import TrainProduct
 from pctt.mat.order import Places, chosen_order
-from pctt.tt.quantise import GridDigits, group_modes
+from pctt.tt.quantise import GridDigits, choose_modes, group_modes, slots_of
 from pctt.tt.train import Array
 
 CSR = tuple[Array, Array, Array]  # row pointers, columns, values of this rank's rows
@@ -59,7 +59,8 @@ class Slots:
         spare = -(-int(np.ceil(1.06 * count)) // box) * box
         self.capacity = spare if self.evolving else count
         capacities = P.comm.tompi4py().allgather(self.capacity)
-        self.first, self.size = sum(capacities[: P.comm.rank]), sum(capacities)
+        self.first = sum(capacities[: P.comm.rank])
+        self.size = slots_of(choose_modes(max(sum(capacities), 1), box))  # with the padding of a train
         self.place = np.empty(count, np.int64)
         self.place[rows] = np.arange(count) * self.capacity // max(count, 1)
         if self.evolving:

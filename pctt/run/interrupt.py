@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 from mpi4py import MPI
@@ -42,3 +45,21 @@ def catch_signals(comm: MPI.Comm) -> None:
 def is_requested(comm: MPI.Comm) -> bool:
     """Whether any rank was asked to end; collective."""
     return comm.allreduce(bool(_noted), MPI.LOR)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """A block, or a function, in which Ctrl-C waits until its end: files and states are whole then, and no library is
+    left amid a call. For scripts and notebooks; the program notes signals by itself."""
+    mine = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not mine or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: asked.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if asked:
+        raise KeyboardInterrupt

@@ -381,6 +381,7 @@ def test_what_is_wrong_is_named():
         refused("masses: a matrix that is not positive definite", G=G, masses=kind(case.M - 20 * np.eye(UNKNOWNS)))
         refused("masses: a matrix that is not positive definite", G=G, masses=kind(np.ones((UNKNOWNS, UNKNOWNS))))
         refused("masses: a matrix that differs from its transpose", G=G, masses=kind(np.triu(case.M)))
+    refused("masses: the second part of the factor is an array; allowed", G=G, masses=scipy.linalg.lu_factor(case.M))
     refused("masses: a solve returns a NaN", G=G, masses=lambda b: b * np.nan)
     refused(r"masses: a solve returns the shape \(5,\)", G=G, masses=lambda b: b[:5])
     refused("masses: G M.-1 G' differs from its transpose", G=G, masses=lambda b: np.triu(case.M) @ b)

@@ -128,6 +128,19 @@ def test_a_heavy_body_is_no_sign_of_it(solver, ratio):
         assert why_unbounded(problem, g) == ""
 
 
+@pytest.mark.parametrize("solver", ["pdip", "apgd", "barzilai_borwein", "spectral", "kucera", "gpminres"])
+@pytest.mark.parametrize("mass", [1e-7, 1e-8])
+def test_a_solution_is_no_sign_of_it_where_a_matrix_knows_no_bodies(solver, mass):
+    """A light body between two of mass 1 that close on it."""
+    part = 1.0 / mass
+    N = np.zeros((6, 6))
+    N[::3, ::3] = [[1.0 + part, -part], [-part, 1.0 + part]]
+    problem = ccp.ConeProblem(SELF, np.array([[-1.0, 0.0, 0.0]] * 2), np.zeros(2), N=N)
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-10, closing_work=np.inf), law=ccp.RELAXATION)
+    assert result.converged, result.reason
+    assert result.impulse[:, 0] == pytest.approx([1.0, 1.0], rel=1e-2)
+
+
 @SOLVERS
 @pytest.mark.parametrize("speed", [1e-100, 1e-60])
 def test_the_unit_of_speeds_does_not_matter(solver, speed):

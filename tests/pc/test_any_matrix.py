@@ -176,3 +176,38 @@ def test_a_matrix_without_entries_gets_its_diagonal(kind):
     assert its == expected
     assert left < 1e-7
     assert any("its diagonal is used" in str(one.message) for one in heard) == (mat.comm.rank == 0)
+
+
+def line(n: int, ring: bool = False) -> PETSc.Mat:
+    """The Laplacian of n points on a line, with a shift, or of a ring, with its null space."""
+    mat = PETSc.Mat().createAIJ((n, n), nnz=3)
+    for i in range(*mat.getOwnershipRange()):
+        mat.setValue(i, i, 2.0 if ring else 2.1)
+        for j in (i - 1, i + 1):
+            if ring or 0 <= j < n:
+                mat.setValue(i, j % n, -1.0)
+    mat.assemble()
+    if ring:
+        mat.setNullSpace(PETSc.NullSpace().create(constant=True))
+    return mat
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize("n", [33, 101, 147, 200])
+@pytest.mark.parametrize(
+    "options",
+    [{"order": "natural"}, {"order": "natural", "variant": "unscaled"}, {"ring": True}],
+    ids=["in order", "unscaled", "null space"],
+)
+def test_numbers_of_rows_that_a_train_pads(n, options):
+    ring = "ring" in options
+    mat = line(n, ring)
+    ksp = solver(mat, rank="20", **{name: value for name, value in options.items() if name != "ring"})
+    x, b = mat.createVecs()
+    b.array[:] = np.cos(np.arange(*mat.getOwnershipRange()))
+    if ring:
+        mat.getNullSpace().remove(b)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # that there is no train
+        ksp.solve(b, x)
+    assert (b - mat * x).norm() < 1e-6 * b.norm()

@@ -249,3 +249,22 @@ def test_each_rank_has_a_factor_of_its_own_rows():
         warnings.simplefilter("ignore")
         solve(failing)
     assert failing.getConvergedReason() < 0
+
+
+@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parametrize("kind", ["aij", "dense"])
+@pytest.mark.parametrize("size", [0, 1, 50])
+def test_ranks_without_rows(kind, size):
+    first = MPI.COMM_WORLD.rank == 0
+    local = (size if first else 0, size)
+    mat = PETSc.Mat().createAIJ((local, local), nnz=3)
+    for row in range(*mat.getOwnershipRange()):
+        for column in range(max(row - 1, 0), min(row + 2, size)):
+            mat.setValue(row, column, 2.1 if row == column else -1.0)
+    mat.assemble()
+    mat, (x, b) = mat.convert(kind, PETSc.Mat()), mat.createVecs()
+    b.set(1.0)
+    ksp = solver(mat)
+    ksp.solve(b, x)
+    assert ksp.getIterationNumber() <= size
+    assert (b - mat * x).norm() <= 1e-7 * b.norm()
