@@ -73,6 +73,7 @@ class Condition(NamedTuple):
     kind: int  #: HELD, MOTOR, LOWER or UPPER
     target: float  #: [m/s, rad/s]
     bound: float = np.inf  #: greatest impulse of a motor
+    way: float = np.inf  #: to where a motor stops [m, rad]; inf: nowhere
 
 
 class Constraint(Tie):

@@ -78,7 +78,8 @@ class Joint(Constraint):
     kind: str
     frames: Sequence[Sequence[float]]  #: (2, 4) quaternions, of which the z axis is that of the joint
     speed: float | None = None  #: that a motor keeps [rad/s] or [m/s]
-    target: float | None = None  #: angle [rad] or position [m] to which a motor goes, in one step as far as it can
+    #: angle [rad] or position [m] to which a motor goes, as fast as its strength lets it go and stop there
+    target: float | None = None
     strength: float = np.inf  #: the greatest torque [N m] or force [N] of the motor
     low: float = -np.inf  #: least angle [rad] or position [m]
     high: float = np.inf  #: greatest one
@@ -98,6 +99,13 @@ class Joint(Constraint):
         checks.positive_or_inf("strength of a motor", self.strength)
         if not self.low <= self.high:
             raise ValueError(f"limits of a joint: the lower one, {self.low:g}, is above the upper one, {self.high:g}")
+        for name in ("target", "low", "high"):
+            angle = getattr(self, name)
+            if self.kind == "hinge" and angle is not None and np.pi < abs(angle) < np.inf:
+                raise ValueError(
+                    f"{name} of a hinge, {angle:g} rad: allowed are angles from -pi to pi; a motor with a speed, and "
+                    "without limits, turns further"
+                )
         if not KINDS[self.kind].motor and (self.driven or np.isfinite([self.low, self.high]).any()):
             raise ValueError(f"a {self.kind} joint has no motor and no limits: allowed are those of hinges and sliders")
 
@@ -144,6 +152,9 @@ class Joint(Constraint):
             if body.name in ends and isinstance(body.motion, Driven):
                 raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
         joint = cls(ends, anchors, frames=frames, **given)
+        if not joint.low <= 0.0 <= joint.high:
+            given = f"{joint.low:g} to {joint.high:g}"
+            raise ValueError(f"limits of {name!r}, {given}: allowed are those about 0, where it is at time zero")
         if (count := KINDS[joint.kind].axes) != 1 + len(more):
             raise ValueError(f"axes of {name!r}: got {1 + len(more)}, allowed are {count} of a {joint.kind} joint")
         return joint
@@ -171,9 +182,10 @@ class Joint(Constraint):
         holds = np.flatnonzero(KINDS[self.kind].holds).tolist()
         found = [Condition(coordinate, HELD, -error[coordinate] / dt) for coordinate in holds]
         if self.driven:
-            speed = self.speed if self.target is None else (self.target - at) / dt
+            way = np.inf if self.target is None else min(max(self.target, self.low), self.high) - at
+            speed = self.speed if self.target is None else way / dt
             speed = min(max(speed, (self.low - at) / dt), (self.high - at) / dt)  # it stops at its limits
-            found.append(Condition(self.coordinate, MOTOR, speed, self.strength * dt))
+            found.append(Condition(self.coordinate, MOTOR, speed, self.strength * dt, way))
         limits = (LOWER, self.low), (UPPER, self.high)
         return found + [Condition(self.coordinate, kind, (end - at) / dt) for kind, end in limits if np.isfinite(end)]
 

@@ -140,9 +140,10 @@ def energy_balance(step: Step) -> dict[str, float]:
         belts = -np.vdot(step.impulse[:, 1:], system.surface)
     if system.drift is not None:
         flow = -np.vdot(step.impulse, system.drift)
+    falling = sum(0.5 * system.dt * world.gravity @ (_momentum(x) + _momentum(y)) for x, y in zip(before[:own], after))
     whole = _summed(
-        comm, kinetic_before=was[0], potential_before=was[1], kinetic=now[0], potential=now[1], normal=normal,
-        tangential=tangential, elastic=elastic, elastic_at_end=elastic_at_end, strained=strained,
+        comm, kinetic_before=was[0], potential_before=was[1], kinetic=now[0], potential=now[1], falling=falling,
+        normal=normal, tangential=tangential, elastic=elastic, elastic_at_end=elastic_at_end, strained=strained,
         strained_at_end=strained_at_end, still=still, least=least, carried=_carried(step, ~moves), attracted=attracted,
         applied=applied, belts=belts, flow=flow,
     )  # fmt: skip
@@ -152,6 +153,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     driving = driving + whole["belts"] + (holding + held_by)
     work = driving - np.vdot(step.impulse_on_large[~moves], mean[~moves])
     rise, fallen = whole["kinetic"] - whole["kinetic_before"], whole["potential_before"] - whole["potential"]
+    fallen = max(fallen, whole["falling"])  # the work of gravity, as that of springs, on the mean velocity of the step
     held, bent = whole["elastic_at_end"] - whole["elastic"], whole["strained_at_end"] - whole["strained"]
     pulled, released = 2.0 * max(whole["attracted"], 0.0), max(-held, 0.0) + max(-bent, 0.0)
     pulled += max(held_at_end - held_by, 0.0)  # with the velocity of the end, for bodies that were at rest
@@ -180,6 +182,13 @@ def _each(pairs: Iterable[tuple[float, float]]) -> tuple[float, float]:
     """The sums of the first and of the second numbers of pairs."""
     first, second = zip(*pairs)
     return sum(first), sum(second)
+
+
+def _momentum(table: Bodies) -> Floats:
+    """That of all bodies (3,) which forces move [N s]."""
+    moves = bodies.is_dynamic(table)
+    total: Floats = table.mass[moves] @ table.velocity[moves, :3]
+    return total
 
 
 def _summed(comm: MPI.Comm, **numbers: float) -> dict[str, float]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from dem import bodies, quaternion
 from dem.arrays import ArrayLike, Bools, Floats, Ints, Keys, places
-from dem.bodies import CLUMP, POLYHEDRON, SPHERE, Bodies
+from dem.bodies import BOX, CLUMP, COMPOUND, CONVEX, POLYHEDRON, SPHERE, Bodies
 from dem.contact import Contacts, contact_order, exceeds_margin, find_contacts, greatest_travel, velocities_about
 from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
@@ -229,11 +229,12 @@ def find_turned(
 
     A step takes the gap of a contact as linear in the velocities. Where bodies turn, its point and its normal move, and
     other points may meet. What overlaps at the end of the step is linearised there: with the normal n of the end, and
-    the gap at the start that leads to the gap of the end with these velocities. This is a step of Newton's method (of
-    sequential quadratic programming) for the gaps at the end of the step. What springs bear, and what a solution
-    leaves, is foreseen. Where it was `tried` in this time step, what turns between two features, or rocks on a flat
-    side, would go to and fro for ever: a linearisation with another normal or point then stays, and the new one is a
-    contact beside it.
+    the gap at the start that leads to the gap of the end with these velocities. A contact that is there with nearly
+    this normal stays, with a gap that is corrected (`_corrected`). This is a step of Newton's method (of sequential
+    quadratic programming) for the gaps at the end of the step. What springs bear, and what a solution leaves, is
+    foreseen. Where it was `tried` in this time step, what turns between two features, or rocks on a flat side, would go
+    to and fro for ever: a linearisation with another normal or point then stays, and the new one is a contact beside
+    it.
     """
     dt = free.dt
     if not _turn(world, velocity[: len(world.grains)], dt, depth):
@@ -253,12 +254,37 @@ def find_turned(
         real = np.maximum(start.gap, -_overlaps_of(contacts, start.body))
         start = replace(start, moved=moved, linear=start.gap, gap=real)
     found = replace(start, a=a, b=b, near=contacts.near).take(missed)
+    if contacts.linear is not None:
+        contacts, found = _corrected(contacts, found, (end.gap - foreseen)[missed], tried, NEAR * depth)
     if tried and len(contacts):
         place = places(contacts.key, found.key)
         others = np.einsum("ci,ci->c", contacts.normal[place], found.normal) < ALIKE
         others |= quaternion.length(contacts.point[place] - found.point) > NEAR * depth
         found = replace(found, key=np.where((place >= 0) & others, found.key + BESIDE[tried], found.key))
     return _joined(world, contacts.take(places(found.key, contacts.key) < 0), found)
+
+
+def _corrected(
+    contacts: Contacts, found: Contacts, deeper: Floats, tried: int, near: float
+) -> tuple[Contacts, Contacts]:
+    """The contacts, whose gaps are corrected where `found` has them again by how much they are `deeper` (n,) at the end
+    of the step than foreseen, and what is found beside them: with another normal, and of bodies with corners, where it
+    was `tried` before, at a point further off than `near` [m].
+
+    What stays has the arms of the start of the step: with those of the end each step would brake a body that rolls,
+    rocks or wobbles (see `dem.contact.ahead`)."""
+    place = places(contacts.key, found.key)
+    same = place >= 0
+    at, own, shape = place[same], found.take(same), found.near.bodies.shape
+    alike = np.einsum("ci,ci->c", contacts.normal[at], own.normal) >= ALIKE
+    if tried:
+        curved = (shape != BOX) & (shape != COMPOUND) & ((shape < POLYHEDRON) | (shape >= CONVEX))
+        moved = quaternion.length(contacts.point[at] - own.point) > near
+        alike &= curved[own.a] | curved[own.b] | ~moved
+    same[same] = alike
+    linear = contacts.linear_gap.copy()
+    linear[place[same]] += deeper[same]
+    return replace(contacts, linear=linear), found.take(~same)
 
 
 def _overlaps_of(contacts: Contacts, body: Ints) -> Floats:

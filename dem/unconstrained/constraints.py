@@ -99,24 +99,24 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     found = geometry(ends.position, ends.quaternion)
     count, every = len(ends.free), [part for _, members in parts for part in members]
     asked = [(n, *each) for n, part in enumerate(every) for each in part.conditions(found.error[n], dt)]
-    which, coordinates, kind, t, bound = (np.array(column) for column in zip(*asked))
+    which, coordinates, kind, t, bound, way = (np.array(column) for column in zip(*asked))
     J, along = np.zeros((len(t), count, 6)), found.rows
     for side in (0, 1):
         np.add.at(J, (np.arange(len(t)), row[which, side]), along[which, coordinates, side])
     root = _roots(ends.inverse_mass)
     B = np.einsum("knx,nxy->kny", J, root).reshape(len(t), -1)
     now, velocity = J.reshape(len(t), -1) @ ends.velocity.ravel(), ends.free.copy()
-    A = B @ B.T
-    slip = np.maximum(DROOP * np.abs(t), np.abs(t - now))
+    A, held = B @ B.T, kind == HELD
+    left = _braked(A, t, bound, np.abs(way), held, now, J.reshape(len(t), -1) @ ends.free.ravel(), dt)
+    slip = np.maximum(DROOP * np.abs(left), np.abs(left - now))
     motors = np.isfinite(bound)
     slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
     on, saturated = kind <= MOTOR, np.zeros(len(t))
     rows = unequal(ends.moments).nonzero()[0]
     known = ends.quaternion[rows], ends.velocity[rows, 3:], ends.moments[rows]
-    spin, middle = np.full((2, count, 3), np.nan)
-    held, left = kind == HELD, t.copy()
-    expected, pushed = push.ravel(), B @ push.ravel()
-    for _ in range(ROUNDS):
+    t, least, expected, pushed = left.copy(), np.inf, push.ravel(), B @ push.ravel()
+    for number in range(ROUNDS):
+        velocity, (spin, middle) = ends.free.copy(), np.full((2, count, 3), np.nan)
         change = np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
         spun, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.spin_change[rows])
         spin[rows] = velocity[rows, 3:] = spun + ends.spin_change[rows]
@@ -130,18 +130,44 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
         last, expected = expected, B.T @ g
         if pushed.any():
             expected = push.ravel() + B.T @ _impulses(A, t, free + pushed, on, saturated)
-        if np.abs(expected - last).max() <= 1e-7 * np.abs(expected).max():
+        differs = np.abs(expected - last).max()
+        if number and differs >= least:
+            break  # at a dead point it diverges: the best round counts
+        best = t, free, on, saturated, spin, middle
+        if number:
+            least = differs
+        if least <= 1e-7 * np.abs(expected).max():
             break
         after = velocity + np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
         if dt * np.abs(after[:, 3:]).max(initial=0.0) > FAR:
+            best = left, *best[1:]
             break
         place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after, dt)
         error = geometry(place, turn).error
         bent = (error - found.error)[which, coordinates] / dt - J.reshape(len(t), -1) @ after.ravel()
         t = np.where(held, left - bent, left)
+    t, free, on, saturated, spin, middle = best
     fixed = (J, B, root, which, coordinates, kind, t, bound, free, slip, found.axes)
     solved = _solved(B, root, t, bound, free, slip, on, saturated)
     return Coupling(*fixed, on, saturated, *solved, spin=spin, middle=middle)
+
+
+def _braked(
+    A: Floats, t: Floats, bound: Floats, way: Floats, held: Bools, now: Floats, free: Floats, dt: float
+) -> Floats:
+    """The velocities t (k,), of motors with a bound that go to a target at most those from which they stop on the `way`
+    (k,) that is left [m, rad], where the loads of this step last: else they go to and fro for ever. Of a motor that can
+    hardly bear its load a tenth of its bound brakes."""
+    t = t.copy()
+    for row in (np.isfinite(bound) & np.isfinite(way)).nonzero()[0]:
+        share = np.linalg.lstsq(A[held][:, held], A[held, row], rcond=1e-12)[0]
+        yields = A[row, row] - A[row, held] @ share
+        load = abs(free[row] - share @ free[held] - now[row])
+        brakes = max(yields * bound[row] - load, 0.1 * yields * bound[row])  # in a step
+        if brakes > 0.0:
+            most = brakes * (np.sqrt(0.25 + 2.0 * way[row] / (brakes * dt)) - 0.5)
+            t[row] = min(max(t[row], -most), most)
+    return t
 
 
 def refound(known: Coupling, push: Floats) -> Coupling | None:

@@ -33,7 +33,8 @@ class OverlapWatch:
 
     def __init__(self, scene: Scene, settings: Settings, stiffness: float) -> None:
         self.elastic = expected_overlap(scene, stiffness, settings.dt)
-        self._large = np.array([least_half(body) for body in scene.large_bodies], float)
+        half = np.array([least_half(body) for body in scene.large_bodies], float)
+        self._large = np.where(half > 0.0, half, np.inf)  # a flat mesh has no thickness
         self._size, self._dt = smallest(scene), settings.dt
         closing = settings.limits.closing_speed
         closes = closing * settings.dt if math.isfinite(closing) else CLOSING * settings.delta

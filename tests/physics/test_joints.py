@@ -177,6 +177,71 @@ def test_a_motor_keeps_its_speed_and_is_changed_within_the_loop():
     assert sim.joint("axle").motor.speed is None
 
 
+@pytest.mark.parametrize("dt", [0.01, 0.002])
+@pytest.mark.parametrize(
+    ("gravity", "strength", "seconds"), [(0.0, 20.0, 1.5), (0.0, 200.0, 0.5), (G, 25.0, 4.0), (G, 40.0, 1.5)]
+)
+def test_a_weak_motor_stops_at_its_target(gravity, strength, seconds, dt):
+    """An arm of 1 m and 4 kg, which bears at most 19.6 N m by its weight, goes up to an angle without passing it."""
+    scene = Scene(friction=0.0, gravity=(0, 0, -gravity))
+    place, inertia = (0.5, 0, 1), (0.01, 0.33, 0.33)
+    scene.add_body("arm", [Box((0.5, 0.03, 0.03))], Dynamic(), mass=4.0, inertia=inertia, position=place)
+    scene.add_joint("pin", None, "arm", anchor=(0, 0, 1), axis=(0, -1, 0), target=1.0, strength=strength)
+    sim, most = simulation(scene, dt), 0.0
+    while sim.time < seconds:
+        sim.step()
+        most = max(most, sim.joint("pin").angle)
+    assert most < 1.005
+    sim.run(steps=20)
+    assert sim.joint("pin").angle == pytest.approx(1.0, abs=1e-6)
+    assert abs(sim.joint("pin").drive) == pytest.approx(4.0 * gravity * 0.5 * np.cos(1.0), abs=1e-4)
+
+
+def test_a_weak_slider_stops_at_its_target_beside_its_limit():
+    scene = Scene(friction=0.0, gravity=(0, 0, 0))
+    scene.add_body("cart", [Box((0.1, 0.1, 0.1))], Dynamic(), mass=1.0, inertia=(0.1, 0.1, 0.1))
+    scene.add_joint(
+        "rail", None, "cart", kind="slider", anchor=(0, 0, 0), axis=(1, 0, 0), target=2.0, strength=5.0, limits=(-1, 1)
+    )
+    sim = simulation(scene, 0.01)
+    sim.run(steps=100)
+    assert sim.joint("rail").position == pytest.approx(1.0, abs=1e-6)
+    sim.change("joint rail", target=-0.5)
+    sim.run(steps=150)
+    assert sim.joint("rail").position == pytest.approx(-0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.4])
+def test_a_linkage_passes_its_dead_points(start):
+    """Two cranks of equal length and a coupler, which may tilt where the three are in line: the motor bears the weight
+    of the three."""
+    scene, length = Scene(friction=0.3), 0.3
+    up, turn = np.array([np.sin(start), 0, np.cos(start)]), (np.cos(start / 2), 0, np.sin(start / 2), 0)
+    cranks = [length / 2 * up, [1, 0, 0] + length / 2 * up]
+    scene.add_boxes(cranks, (0.02, 0.02, length / 2), 1000.0, quaternions=[turn, turn])
+    scene.add_boxes([0.5, 0.05, 0] + length * up, (0.5, 0.02, 0.02), 1000.0)
+    scene.add_joint("A", None, 0, anchor=(0, 0, 0), axis=(0, 1, 0), speed=3.0)
+    scene.add_joint("B", None, 1, anchor=(1, 0, 0), axis=(0, 1, 0))
+    scene.add_joint("C", 0, 2, anchor=length * up, axis=(0, 1, 0))
+    scene.add_joint("D", 1, 2, anchor=[1, 0, 0] + length * up, axis=(0, 1, 0))
+    sim, drives = pctt.Simulation(scene, dt=0.0045), []
+    while sim.time < 4.0:
+        sim.step()
+        drives.append(abs(sim.joint("A").drive))
+        assert abs(sim.orientations[2][2]) < 1e-4  # the coupler stays level
+    assert max(drives[3:]) == pytest.approx(G * length * (0.48 + 1.6), rel=0.01)
+
+
+def test_a_ball_without_weight_is_held_from_the_first_step_on():
+    """It goes about a ball joint at its surface with nothing that pushes at the start."""
+    scene = Scene(friction=0.3, gravity=(0, 0, 0))
+    (ball,) = scene.add_spheres([0.05, 0, 0], 0.05, 1000.0, velocity=(0, 3.0, 0), angular_velocity=(0, 0, 60.0))
+    scene.add_joint("pin", None, ball, kind="ball", anchor=(0, 0, 0))
+    sim = simulation(scene, 0.002)
+    sim.run(steps=3)
+    assert np.linalg.norm(sim.positions[0]) == pytest.approx(0.05, rel=1e-6)
+
+
 def test_a_weak_motor_stalls_at_its_torque_and_its_work_is_in_the_balance():
     sim = simulation(wheel(speed=100.0, strength=0.2))
     moment = sim.local.inertia[0, 0]
@@ -456,6 +521,10 @@ def test_a_body_that_is_squeezed_against_its_joint_has_no_solution():
         ({"kind": "ball", "speed": 1.0}, "no motor"),
         ({"limits": (1.0, 0.0)}, "limits"),
         ({"strength": -1.0}, "strength"),
+        ({"target": 4.0}, "target of a hinge, 4 rad: allowed are angles from -pi to pi"),
+        ({"limits": (-1.0, 3.2)}, "high of a hinge, 3.2 rad"),
+        ({"limits": (-4.0, 1.0), "speed": 1.0}, "low of a hinge, -4 rad"),
+        ({"limits": (0.5, 1.0)}, "limits of 'axle', 0.5 to 1: allowed are those about 0, where it is at time zero"),
     ],
 )
 def test_wrong_joints_are_refused(given, words):

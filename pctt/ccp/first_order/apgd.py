@@ -36,7 +36,8 @@ NEAR = 1e-4  # residual below which slow chains of force are left
 
 @dataclass(frozen=True)
 class APGD(FirstOrder):
-    """The numbers of the method, set from Python. L is the estimate of the curvature along a step; its inverse is the step's length."""
+    """The numbers of the method, set from Python. L is the estimate of the curvature along a step; its inverse is the
+    step's length."""
 
     check: int = number(25, "most iterations between two looks at the natural residual")
     lipschitz: float = number(2.0, "the first L: A has a diagonal of about one, and on packings L is 2 to 3")
