@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dem.arrays import ArrayLike, Floats
+from dem.arrays import ArrayLike, Floats, Ints
 
 
 def nearest(name: str, known: Iterable[str], dash: str = "", alike: float = 0.6) -> str:
@@ -60,6 +60,12 @@ def between(low: float, high: float = np.inf) -> Callable[[str, float], None]:
     return check
 
 
+def zero_or_one(name: str, value: float) -> None:
+    """Raise ValueError unless a number is 0 or 1."""
+    if value not in (0.0, 1.0):
+        raise ValueError(f"{name} must be 0 or 1, got {value:g}")
+
+
 def rows(name: str, values: ArrayLike, count: int, *row: int) -> Floats:
     """Return `values` as finite numbers (count, *row); one row stands for all."""
     array = finite(name, values)
@@ -76,6 +82,14 @@ def shape(name: str, array: Floats, count: int, *row: int) -> None:
 def vector(name: str, values: ArrayLike) -> Floats:
     """Return three finite numbers."""
     return rows(name, values, 1, 3)[0]
+
+
+def counts(name: str, values: ArrayLike) -> Ints:
+    """Return three whole numbers above zero."""
+    array = vector(name, values)
+    if (array < 1.0).any() or (array % 1.0).any():
+        raise ValueError(f"{name}: allowed are whole numbers >= 1, got {', '.join(f'{x:g}' for x in array)}")
+    return array.astype(np.int64)
 
 
 def unit_vector(name: str, values: ArrayLike) -> Floats:

@@ -55,7 +55,8 @@ def random_packing(
     most: int = 20000,
 ) -> tuple[Floats, Floats]:
     """Return centres (n, 3) and radii (n,) [m] of spheres without overlaps in the box from zero to the `lengths` (3,)
-    [m], with at least this solid `fraction`, up to about 0.6.
+    [m], with at least this solid `fraction`: up to about 0.6 where all axes are periodic. Walls leave more room between
+    spheres: equal ones reach 0.50 in a box of 10 radii, 0.55 in one of 20, 0.58 in one of 40.
 
     Along `periodic` axes the box repeats itself; others have walls, which spheres do not cross. Spheres of a tenth of
     the volume are put at random places; then they grow from step to step, and what overlaps is pushed apart (Jodrey,

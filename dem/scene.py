@@ -199,7 +199,8 @@ class Scene:
         self.cell = cell.of_scene(*given)
         self.gravity = checks.vector("gravity", gravity)
         self.large_bodies: list[LargeBody] = []
-        #: Names of large bodies that go away from the grains: their speed asks for no stiffness.
+        #: Names of large bodies that go away from the grains: their speed asks for no stiffness. A simulation refuses
+        #: names that no large body has.
         self.leaving: set[str] = set()
         self._law = contact_law.law({"friction": friction, **law})
         self._pairs: dict[tuple[int, int], ContactLaw] = {}

@@ -4,7 +4,8 @@
     scene.add_spheres(**read_spheres("points.csv", density=2500.0, length=1e-3))  # in millimetres
 
 Read are data files of LAMMPS and LIGGGHTS (`write_data`) and their text dumps (`dump custom`), text of Yade (x y z r),
-tables with a line of names (CSV, also those of ParaView), and points of VTK (.vtk, .vtp, .vtu); each also as .gz.
+tables with a line or a comment of names (CSV, also those of ParaView, numpy.savetxt), and points of VTK (.vtk, .vtp,
+.vtu); each also as .gz.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from dem import checks
 from dem.arrays import ArrayLike, Floats
 
 #: Columns of the section Atoms of a data file, by the style in its head. A line may have three flags of images more.
@@ -81,6 +83,7 @@ def read_spheres(
     millimetres; its masses are kg, its densities kg/m^3. Spheres with ids are in their order. ValueError, which names
     the file and the line, for what cannot be read, is no number, or is missing.
     """
+    checks.positive("length", length)
     try:
         data = Path(path).read_bytes()
         found = _read(gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data, frame)
@@ -91,7 +94,7 @@ def read_spheres(
         raise ValueError(f"{path}: the compressed file is truncated") from None
     except Unreadable as error:
         raise ValueError(f"{path}: {error}") from None
-    except (ArithmeticError, IndexError, TypeError, ValueError) as error:  # what damage makes of a reader
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # what damage makes of a reader
         raise ValueError(f"{path}: damaged or truncated ({str(error)[:100]})") from None
 
 
@@ -110,11 +113,12 @@ def _spheres(found: Found, density: Any, radius: Any, type: int | str | None, le
     columns, rows = {_name(key): column for key, column in found.columns.items()}, None
     kinds = columns.get("type")
     if kinds is not None:
-        kinds = (kinds if kinds.dtype.kind == "U" else kinds.astype(int)).astype(str)
+        names, which = np.unique(kinds, return_inverse=True)
+        kinds = np.array([_kind(str(name)) for name in names.tolist()])[which]
     if type is not None:
         if kinds is None:
             raise Unreadable(f"type {type}: {_lacks(columns, 'type')}")
-        rows = np.flatnonzero(kinds == str(type))
+        rows = np.flatnonzero(kinds == _kind(str(type)))
         if not len(rows):
             raise Unreadable(f"type {type}: no sphere has it; there are {', '.join(np.unique(kinds))}")
     order = np.argsort(_numbers(columns["id"], "id", found.place), kind="stable") if "id" in columns else None
@@ -160,6 +164,11 @@ def _name(text: str) -> str:
     return SCALARS.get(plain, plain)
 
 
+def _kind(word: str) -> str:
+    """What a type is called: a whole number without the point that tables of floats give it."""
+    return str(int(float(word))) if _is_number(word) and float(word).is_integer() else word
+
+
 def _lacks(columns: dict[str, Any], what: str) -> str:
     return f"has no {what}; its columns are {', '.join(columns)}"
 
@@ -196,7 +205,8 @@ def _positive(values: Floats, name: str, rows: np.ndarray, place: Callable[[int]
 
 
 def _lines(data: bytes) -> list[str]:
-    return data.decode("utf-8-sig", "replace").splitlines()
+    """With their ends, of which the last one of a truncated file has none."""
+    return data.decode("utf-8-sig", "replace").splitlines(keepends=True)
 
 
 def _rows(lines: Sequence[str], first: int, count: int | None, names: Sequence[str], more: Sequence[int] = (0,),
@@ -214,7 +224,8 @@ def _rows(lines: Sequence[str], first: int, count: int | None, names: Sequence[s
         row = [word.strip().strip("\"'") for word in line.split(cut)]
         if len(row) - len(names) not in more:
             words = f"{len(row)} values where {len(names)} are needed ({' '.join(names)})"
-            raise Unreadable(f"line {number}: {words}" + ("; the file is truncated" if number == len(lines) else ""))
+            short = len(row) < len(names) + max(more) and not lines[number - 1].endswith(("\n", "\r"))
+            raise Unreadable(f"line {number}: {words}{'; the file is truncated' if short else ''}")
         rows.append(row[: len(names)])
         kept.append(number)
     if not rows or len(rows) < (count or 0):
@@ -282,6 +293,10 @@ def _frame(lines: list[str], at: dict[str, int], head: int, names: list[str]) ->
     columns, scaled = found.columns, [name for name in ("xs", "xsu") if name in found.columns]
     if "x" in columns or "xu" in columns or not scaled:
         return found
+    names = [scaled[0].replace("x", axis) for axis in "xyz"]
+    if not set(names) <= set(columns):
+        needed = f"{scaled[0]} needs {' and '.join(names[1:])}"
+        raise Unreadable(f"line {head + 1}: {needed}; the columns are {', '.join(columns)}")
     if "BOX BOUNDS" not in at:
         raise Unreadable(f"line {head + 1}: {scaled[0]} needs ITEM: BOX BOUNDS, which is not there")
     box = _rows(lines, at["BOX BOUNDS"] + 1, 3, ["low", "high"], (0, 1))
@@ -291,12 +306,13 @@ def _frame(lines: list[str], at: dict[str, int], head: int, names: list[str]) ->
     low -= [min(0.0, xy, xz, xy + xz), min(0.0, yz), 0.0]
     high -= [max(0.0, xy, xz, xy + xz), max(0.0, yz), 0.0]
     edges = np.diag(high - low) + np.array([[0.0, xy, xz], [0.0, 0.0, yz], [0.0, 0.0, 0.0]])
-    parts = [_numbers(columns[scaled[0].replace("x", axis)], axis, found.place) for axis in "xyz"]
+    parts = [_numbers(columns[name], name, found.place) for name in names]
     return Found({**columns, **dict(zip("xyz", low[:, None] + edges @ np.array(parts)))}, found.place)
 
 
 def _table(data: bytes) -> list[Callable[[], Found]]:
-    """Of a table with a line of names, or of Yade, whose comment #format has them; without them they are x y z r."""
+    """Of a table with a line of names, or a comment that has them: #format of Yade, or one with x, y and z, as of
+    numpy.savetxt; without them they are x y z r."""
     lines = _lines(data)
     first = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), len(lines))
     if first == len(lines):
@@ -308,8 +324,19 @@ def _table(data: bytes) -> list[Callable[[], Found]]:
     if named:
         names, first = words, first + 1
     else:
-        names = formats[-1].split("_") if formats else ["x", "y", "z", "r", "clump"][: min(max(len(words), 4), 5)]
+        heads = [formats[-1].split("_")] if formats else [*filter(_places, map(_heading, lines[:first]))]
+        names = heads[-1] if heads else ["x", "y", "z", "r", "clump"][: min(max(len(words), 4), 5)]
     return [lambda: _rows(lines, first, None, names, range(20) if "attrs" in names else (0,), cut)]
+
+
+def _heading(comment: str) -> list[str]:
+    """The words of a comment, without units in brackets and what announces them, such as "columns:"."""
+    plain = re.sub(r"^[#\s]*(\w+:\s)?|[\[(].*?[\])]", "", comment.rstrip())
+    return [word.strip() for word in plain.split(next((mark for mark in ";,\t" if mark in plain), None))]
+
+
+def _places(names: list[str]) -> bool:
+    return {"x", "y", "z"} <= set(map(_name, names))
 
 
 # -- VTK -----------------------------------------------------------------------------------------------------
@@ -379,13 +406,13 @@ def _legacy(data: bytes) -> list[Callable[[], Found]]:
     """Of a legacy VTK file with points."""
 
     def read() -> Found:
-        file, arrays, cells, of_points = _Legacy(data), {}, (0, 0), True
+        file, arrays, cells, of_points, rows = _Legacy(data), {}, (0, 0), True, 0
         for key, *words in file.lines():
             word = key.upper()
             if word == "DATASET" and words[0].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
                 raise Unreadable(f"dataset {words[0]}; allowed is POLYDATA or UNSTRUCTURED_GRID with points")
             if word in ("POINT_DATA", "CELL_DATA"):
-                of_points = word == "POINT_DATA"
+                of_points, rows = word == "POINT_DATA", int(words[0])
             elif word == "POINTS":
                 arrays["points"] = file.numbers(3 * int(words[0]), words[1]).reshape(-1, 3)
             elif word in ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS", "CELLS"):
@@ -400,12 +427,12 @@ def _legacy(data: bytes) -> list[Callable[[], Found]]:
                 parts = 3 if word != "SCALARS" else int(words[2]) if len(words) > 2 else 1
                 if word == "SCALARS":
                     file.line()  # LOOKUP_TABLE
-                values = file.numbers(parts * len(arrays["points"]), words[1])
+                values = file.numbers(parts * rows, words[1])
                 arrays |= {unquote(words[0]): values.reshape(-1, parts)} if of_points else {}
             elif word == "FIELD":
                 for _ in range(int(words[1])):
-                    name, parts_, rows, kind = next(file.lines())
-                    values = file.numbers(int(parts_) * int(rows), kind)
+                    name, parts_, rows_, kind = next(file.lines(), [])
+                    values = file.numbers(int(parts_) * int(rows_), kind)
                     arrays |= {unquote(name): values.reshape(-1, int(parts_))} if of_points else {}
         return _points(arrays)
 

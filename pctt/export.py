@@ -24,19 +24,23 @@ from mpi4py import MPI
 from pctt.disk import FileError, hdf5, refuse_links, whole, write_text
 from pctt.folder import RUN_FILES, Folder, Frame
 from pctt.look.program import chosen, described_steps, made_folder, parser, run
+from pctt.options import OptionError
 
 SERIES = ("bodies", "contacts", "large")
 
 
 def arguments() -> argparse.Namespace:
     line = parser("export", "the recorded steps of a run as time series for ParaView (.pvd of .vtp files)", "paraview")
-    line.add_argument("-format", choices=("vtp", "vtkhdf"), default="vtp", help="a .vtp file per step, or one .vtkhdf")
+    line.add_argument("-format", choices=("vtp", "vtkhdf"), help="a .vtp file per step, the usual, or one .vtkhdf")
     line.add_argument("-single", type=Path, metavar="FILE.h5", help="write one HDF5 file like state.h5 instead")
     return line.parse_args()
 
 
 def main(comm: MPI.Comm) -> None:
     given = arguments()
+    if given.single and (given.output or given.format):
+        other = f"-output {given.output}" if given.output else f"-format {given.format}"
+        raise OptionError(f"{other}: has no effect on the file of -single {given.single}; allowed is one of them")
     folder = Folder(given.folder)
     folder.require_frames()
     steps = chosen(folder.steps, given)
@@ -54,7 +58,8 @@ def main(comm: MPI.Comm) -> None:
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # the writers' results are checked
     names = [*SERIES, *(["polyhedra"] if any("triangles" in form for form in folder.forms) else [])]
     scene = Scene(folder, [folder.frame(step) for step in (steps[0], steps[-1])])
-    if given.format == "vtp":
+    form = given.format or "vtp"
+    if form == "vtp":
         times = {}
         for step in steps[comm.rank :: comm.size]:
             frame = folder.frame(step)
@@ -64,12 +69,12 @@ def main(comm: MPI.Comm) -> None:
         shared = comm.gather(times)
     if comm.rank == 0:
         for name in names:
-            if given.format == "vtp":
+            if form == "vtp":
                 together = {step: time for part in shared or [] for step, time in part.items()}
                 write_pvd(target / f"{name}.pvd", {f"{name}_{step:06d}.vtp": together[step] for step in steps})
             else:
                 write_vtkhdf(target / f"{name}.vtkhdf", name, scene, steps)
-        kind = "pvd" if given.format == "vtp" else "vtkhdf"
+        kind = "pvd" if form == "vtp" else "vtkhdf"
         print(f"{described_steps(folder, steps)}: {target}/" + ", ".join(f"{name}.{kind}" for name in names))
     comm.Barrier()  # all files exist when any rank returns
 

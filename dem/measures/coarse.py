@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dem.arrays import Floats
-from dem.checks import positive
+from dem.checks import counts, positive
 from dem.compiled import loop
 from dem.geometry.region import Block
 from dem.measures.grains import branches, ends
@@ -37,11 +37,11 @@ def fields(sample: Sample, region: Block, cells: Sequence[int], width: float, ke
     `width` [m]: of the kernel "lucy" its range; of "gauss" the standard deviation, and it is cut at three of these
     and normalised. The integral of a contact's force along its branch takes three Gauss points on every branch.
     Source: Goldhirsch (2010), Granular Matter 12, 239-252; Weinhart et al. (2012), Granular Matter 14, 289-294.
-    ValueError for a bad kernel or width."""
+    ValueError for a bad kernel, width or number of cells."""
     positive("width of the kernel", width)
     if kernel not in KERNELS:
         raise ValueError(f"kernel {kernel!r}: allowed is one of {', '.join(KERNELS)}")
-    (low, high), shape, gauss = region.bounds, np.array(cells, np.int64), kernel == "gauss"
+    (low, high), shape, gauss = region.bounds, counts("cells", cells), kernel == "gauss"
     spacing, reach = (high - low) / shape, float(width) * (CUT if gauss else 1.0)
     grid = low, spacing, shape, float(width), gauss
     row, place, v = sample.grains_in(low, high, reach)

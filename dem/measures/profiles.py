@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dem.arrays import ArrayLike, Bools, Floats
+from dem.checks import counts, unit_vector
 from dem.geometry.region import Block
 from dem.measures.sample import Sample, summed
 
@@ -26,8 +27,8 @@ def profile(sample: Sample, axis: ArrayLike, edges: ArrayLike) -> Profile:
     """Return what is where along a direction `axis` (3,), in bins between the ascending `edges` (bins + 1,) [m].
 
     Along an axis with a period the edges may go on beyond the cell, with images of its grains; along other directions
-    each grain counts once."""
-    edge, along = np.asarray(edges, float), np.asarray(axis, float) / np.linalg.norm(axis)
+    each grain counts once. ValueError for an axis that is no direction."""
+    edge, along = np.asarray(edges, float), _direction(axis)
     own = np.abs(along) > 1.0 - 1e-12
     ends = np.where(own[:, None], np.sort(np.sum(along * own) * edge[[0, -1]]), [-np.inf, np.inf])
     repeated = replace(sample, lattice=sample.lattice * own[:, None])
@@ -41,6 +42,14 @@ def profile(sample: Sample, axis: ArrayLike, edges: ArrayLike) -> Profile:
     table = summed(sample, table)
     velocity = table[:, 2:] / np.where(table[:, 1] > 0.0, table[:, 1], 1.0)[:, None]
     return Profile(0.5 * (edge[1:] + edge[:-1]), table[:, 0], table[:, 1], velocity)
+
+
+def _direction(axis: ArrayLike) -> Floats:
+    try:
+        return unit_vector("axis", axis)
+    except (TypeError, ValueError):
+        allowed = "allowed are three numbers that are not all zero, such as (0, 0, 1)"
+        raise ValueError(f"axis {axis!r}: {allowed}") from None
 
 
 def mean_position(sample: Sample, mask: Bools) -> Floats:
@@ -62,7 +71,7 @@ def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> 
     With p the fraction of them among all, and s^2 the variance of the fractions in the cells, each with the weight of
     its grains: Lacey's index is (p (1 - p) - s^2) / (p (1 - p) - p (1 - p) / m) for cells of m grains on average that
     are not empty. NaN if there is one kind alone, or one grain per cell."""
-    shape, (low, high) = np.array(cells, np.int64), region.bounds
+    shape, (low, high) = counts("cells", cells), region.bounds
     rows, position, _ = sample.grains_in(low, high)
     inside = region.contains(position)
     rows, place = rows[inside], ((position[inside] - low) / ((high - low) / shape)).astype(np.int64)

@@ -17,15 +17,14 @@ from dem.measures.sample import Sample, summed
 def stress(sample: Sample, region: Region | Bools, volume: float | None = None) -> Floats:
     """Return the mean contact stress (3, 3) of a region, or of the grains of a mask (n,) over a given volume [m^3]: the
     sum of force times branch over the volume [Pa]. A region counts of each branch the part within it, so neighbouring
-    regions leave nothing out. ValueError for a mask without volume."""
+    regions leave nothing out. ValueError for a mask without volume, and for a region with one beside its own."""
     end = ends(sample)
     if isinstance(region, (Block, Cylinder)):
         row, point, branch = branches(sample, end, *region.bounds)
-        part, force, volume = region.part(point, point + branch), end.force.take(row, axis=0), region.volume
+        part, force = region.part(point, point + branch), end.force.take(row, axis=0)
     else:
         part, force, branch = _everywhere(sample, region)[end.grain], end.force, end.center - end.point
-        volume = _volume(volume)
-    return summed(sample, (part[:, None] * force).T @ branch) / volume
+    return summed(sample, (part[:, None] * force).T @ branch) / _volume(region, volume)
 
 
 def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None = None) -> Floats:
@@ -33,13 +32,13 @@ def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None 
     centres in a region, or of those of a mask; v' is the velocity beyond the mean one of these [Pa]."""
     if isinstance(region, (Block, Cylinder)):
         row, place, velocity = sample.grains_in(*region.bounds)
-        inside, volume = region.contains(place), region.volume
+        inside = region.contains(place)
         mass, velocity = sample.mass[row[inside]], velocity[inside]
     else:
-        mass, velocity, volume = sample.mass[region], sample.velocity[region, :3], _volume(volume)
+        mass, velocity = sample.mass[region], sample.velocity[region, :3]
     total = summed(sample, np.append(mass @ velocity, mass.sum()))
     beyond = velocity - total[:3] / (total[3] or 1.0)
-    return summed(sample, (beyond.T * mass) @ beyond) / volume
+    return summed(sample, (beyond.T * mass) @ beyond) / _volume(region, volume)
 
 
 def fabric(sample: Sample, region: Region) -> Floats:
@@ -107,7 +106,13 @@ def _everywhere(sample: Sample, mask: Bools) -> Floats:
     return np.asarray(summed(sample, out))
 
 
-def _volume(volume: float | None) -> float:
+def _volume(region: Region | Bools, volume: float | None) -> float:
+    """That of a region, or the one given with a mask [m^3]."""
+    if isinstance(region, (Block, Cylinder)):
+        if volume is not None:
+            own = f"a {type(region).__name__} has its own, {region.volume:g} m^3"
+            raise ValueError(f"volume {volume:g}: {own}; give none")
+        return region.volume
     if volume is None:
         raise ValueError("volume: a mask of grains needs the volume over which its stress is a mean")
     return float(positive("volume", volume))

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies
+from dem import bodies, checks
 from dem.arrays import Ints
 from dem.bodies import Bodies
 from dem.contact import find_contacts
@@ -133,6 +133,7 @@ def even_slice(count: int, comm: MPI.Comm) -> slice:
 
 
 def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
+    refuse_unknown(scene)
     pairs = comm.bcast(stiffness.pairs(scene))  # of one processor
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
     world.named, world.cell = {kind: dict(members) for kind, members in scene.named.items()}, scene.cell
@@ -148,6 +149,14 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
         for name, part in members.items():
             part.refuse(name, world)
     return world
+
+
+def refuse_unknown(scene: Scene) -> None:
+    """Raise ValueError for a name in `Scene.leaving` that no large body has."""
+    names = [body.name for body in scene.large_bodies]
+    for name in sorted(set(scene.leaving) - set(names)):
+        allowed = f"allowed are {', '.join(names) or 'none'}{checks.nearest(name, names)}"
+        raise ValueError(f"leaving: there is no large body {name!r}; {allowed}")
 
 
 def refuse_overlap(world: World, overlap: float) -> None:

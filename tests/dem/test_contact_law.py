@@ -32,6 +32,8 @@ def test_a_pair_has_the_law_of_the_scene_but_for_what_is_given():
         ({"friction": -0.1}, "friction must not be negative, got -0.1"),
         ({"stiffness": 0.0}, "stiffness must be positive, or inf, got 0"),
         ({"restitution": 1.5}, "restitution must be from 0 to 1, got 1.5"),
+        ({"touching": 0.3}, "touching must be 0 or 1, got 0.3"),
+        ({"touching": np.nan}, "touching must be 0 or 1, got nan"),
         ({"cohesion": 1.0}, "cohesion: needs a cohesion_range"),
         ({"spinning": np.nan}, "spinning: NaN"),
     ],

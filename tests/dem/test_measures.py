@@ -89,6 +89,9 @@ def test_the_stress_of_a_column_is_its_mean_weight_and_regions_leave_nothing_out
     assert measures.stress(column(), round_one)[2, 2] == pytest.approx(7 * R * MASS * G / round_one.volume)
     with pytest.raises(ValueError, match="volume"):
         measures.stress(column(), np.ones(4, bool))
+    for measure in (measures.stress, measures.kinetic_stress):
+        with pytest.raises(ValueError, match=r"volume 3: a Block has its own, 8 m\^3; give none"):
+            measure(column(), WIDE, 3.0)
 
 
 def test_a_line_through_a_cylinder():
@@ -152,6 +155,24 @@ def test_bad_kernels_are_refused():
         measures.fields(column(), WIDE, (2, 2, 2), 0.1, "box")
     with pytest.raises(ValueError, match="width of the kernel"):
         measures.fields(column(), WIDE, (2, 2, 2), 0.0)
+
+
+@pytest.mark.parametrize(("cells", "words"), [
+    ((4, 0, 4), r"cells: allowed are whole numbers >= 1, got 4, 0, 4"),
+    ((4, 2.5, 4), r"cells: allowed are whole numbers >= 1, got 4, 2.5, 4"),
+    ((4, 4), r"cells must have shape \(3,\)"),
+])  # fmt: skip
+def test_a_grid_without_cells_is_refused(cells, words):
+    with pytest.raises(ValueError, match=words):
+        measures.fields(column(), WIDE, cells, 0.1)
+    with pytest.raises(ValueError, match=words):
+        measures.mixing(column(), np.ones(4, bool), WIDE, cells)
+
+
+@pytest.mark.parametrize("axis", [2, "z", (0, 1), (0, 0, 0), (0, 0, np.nan)])
+def test_an_axis_of_a_profile_that_is_no_direction_is_refused(axis):
+    with pytest.raises(ValueError, match=r"axis .*: allowed are three numbers that are not all zero"):
+        measures.profile(column(), axis, [0, 1])
 
 
 def test_a_profile_of_a_shear_flow():

@@ -29,6 +29,13 @@ def test_a_packing_has_its_fraction_and_no_overlap(fraction, periodic):
     assert radius.max() <= 0.08
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_equal_spheres_fill_half_of_a_small_box_between_walls(seed):
+    position, radius = random_packing((1, 1, 1), 0.1, 0.5, seed=seed)
+    assert 4 / 3 * np.pi * (radius**3).sum() >= 0.5
+    assert min(gaps(position, radius, np.ones(3), (False,) * 3)) >= 0.0
+
+
 def test_a_packing_follows_from_its_seed():
     one, two, other = (random_packing((1, 1, 1), 0.1, 0.3, seed=seed)[0] for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, two)

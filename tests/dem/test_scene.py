@@ -176,6 +176,17 @@ def test_an_empty_scene_is_refused():
         new_world(scene, SELF)
 
 
+@pytest.mark.parametrize("leaving", [["floor", "gat"], {"gat"}])
+def test_a_leaving_body_that_is_not_there_is_refused(leaving):
+    scene = Scene(friction=0.3)
+    scene.add_spheres([[0, 0, 1]], 0.1, 1000.0)
+    scene.leaving = leaving
+    scene.add_body("floor", FLOOR)
+    scene.add_body("gate", [Sphere(0.1)], position=(0, 0, 2))
+    with pytest.raises(ValueError, match=r"leaving: .* no large body 'gat'; allowed are floor, gate; .*mean gate\?"):
+        new_world(scene, SELF)
+
+
 def test_an_overlapping_start_names_the_worst_pair_and_its_depth():
     scene = Scene(friction=0.3)
     scene.add_spheres([[0, 0, 1], [0, 0, 1.15], [0, 0, 1.25], [3, 0, 1]], 0.1, 1000.0)

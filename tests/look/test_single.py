@@ -57,6 +57,13 @@ def test_the_files_of_the_run_are_refused_as_target(show, tmp_path):
         show("export", "-single", made / "one.h5", folder=made)
 
 
+@pytest.mark.parametrize("other", [("-output", "more"), ("-format", "vtp"), ("-format", "vtkhdf")])
+def test_options_of_series_are_refused_beside_one_file(show, tmp_path, other):
+    said = show("export", "-single", tmp_path / "one.h5", *other, status=2).stderr
+    assert f"{' '.join(other)}: has no effect on the file of -single" in said
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_copy_of_the_links_alone_says_that_it_is_empty(folder, tmp_path):
     shutil.copy(folder / "state.h5", tmp_path)
     with h5py.File(tmp_path / "state.h5") as file:

@@ -85,6 +85,9 @@ def test_a_frame_of_a_dump_is_chosen(tmp_path):
     '"Points:0","Points:1","Points:2",radii\n{0},{1},{2},{3}\n',
     "id;x [mm]; y [mm];z [mm];Diameter (mm)\n1;{0};{1};{2};{4}\n",
     "\ufeffx y z r\r\n{0} {1} {2} {3}\r\n",
+    "# a packing\n# x y z diameter\n{0} {1} {2} {4}\n",
+    "# id x [mm] y [mm] z [mm] radius (mm)\n1 {0} {1} {2} {3}\n",
+    "#columns: radius, x, y, z\n{3},{0},{1},{2}\n",
 ])  # fmt: skip
 def test_tables_of_yade_paraview_and_others(tmp_path, text):
     found = read_spheres(written(tmp_path, text.format(3.0, -4.0, 5.5, 0.25, 0.5)), density=1200.0, length=1e-3)
@@ -93,19 +96,31 @@ def test_tables_of_yade_paraview_and_others(tmp_path, text):
     assert found["density"] == 1200.0
 
 
+@pytest.mark.parametrize("data", [
+    "x,y,z,r,type\n0,0,0,1,1.0\n3,0,0,1,2.0\n6,0,0,1,clay\n",
+    "# x y z r type\n0 0 0 1 1.000e+00\n3 0 0 1 2.000e+00\n6 0 0 1 clay\n",
+])  # fmt: skip
+def test_types_that_are_whole_numbers_are_called_so(tmp_path, data):
+    path = written(tmp_path, data)
+    assert read_spheres(path, density=1.0)["material"] == ["type 1", "type 2", "clay"]
+    for type_ in (2, 2.0, "2"):
+        assert read_spheres(path, density=1.0, type=type_)["positions"][:, 0].tolist() == [3.0]
+
+
 X, R = np.arange(12.0).reshape(4, 3), np.array([0.1, 0.2, 0.3, 0.4])
 
 
-def legacy(binary):
+def legacy(binary, cells_first=False):
     def block(array, kind):
         return array.astype(kind).tobytes() + b"\n" if binary else " ".join(map(str, array.ravel())).encode() + b"\n"
 
     cells = np.array([[1, k] for k in range(4)])
     form = b"BINARY" if binary else b"ASCII"
+    of_cells = b"CELL_DATA 2\nSCALARS radius float\nLOOKUP_TABLE default\n" + block(np.array([7.0, 8.0]), ">f4")
     return b"".join([
         b"# vtk DataFile Version 3.0\nspheres\n" + form + b"\nDATASET POLYDATA\n",
         b"POINTS 4 double\n" + block(X, ">f8") + b"VERTICES 4 8\n" + block(cells, ">i4"),
-        b"POINT_DATA 4\nSCALARS radius float\nLOOKUP_TABLE default\n" + block(R, ">f4"),
+        of_cells * cells_first + b"POINT_DATA 4\nSCALARS radius float\nLOOKUP_TABLE default\n" + block(R, ">f4"),
         b"VECTORS velocity double\n" + block(-X, ">f8") + b"FIELD FieldData 2\n",
         b"mass 1 4 double\n" + block(7 * R**3, ">f8") + b"kind 1 4 int\n" + block(cells[:, 1], ">i4"),
     ])
@@ -140,10 +155,11 @@ def in_xml(form, packed=False, word="<u4"):
 
 
 @pytest.mark.parametrize("data", [
-    legacy(False), legacy(True), in_xml(("ascii", "")), in_xml(("binary", "base64")),
-    in_xml(("binary", "base64"), True), in_xml(("appended", "raw"), word="<u8"), in_xml(("appended", "raw"), True),
+    legacy(False), legacy(True), legacy(False, True), legacy(True, True),
+    in_xml(("ascii", "")), in_xml(("binary", "base64")), in_xml(("binary", "base64"), True),
+    in_xml(("appended", "raw"), word="<u8"), in_xml(("appended", "raw"), True),
     in_xml(("appended", "base64"), True, "<u8"),
-], ids=range(8))  # fmt: skip
+], ids=range(10))  # fmt: skip
 def test_points_of_vtk_files(tmp_path, data):
     found = read_spheres(written(tmp_path, data))
     assert found["positions"] == pytest.approx(X)
@@ -152,16 +168,25 @@ def test_points_of_vtk_files(tmp_path, data):
     assert found["density"] == pytest.approx(7 / (4 / 3 * np.pi))
 
 
+DUMP = "ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n1\nITEM: ATOMS {0} radius density\n1 1 1 1 1\n"
+
+
 @pytest.mark.parametrize(("text", "given", "words"), [
     ("x,y,z\n1,2,3\n", {}, r"bed: has no radius or diameter; its columns are x, y, z; give radius= in metres"),
     ("x,y,z,r\n1,2,3,4\n", {}, r"has no density or mass; .* give density= in kg/m\^3"),
     ("x,y,z,r\n1,2,3,4\n1,nan,3,4\n", {"density": 1}, r"line 3: y is nan; allowed is a finite number"),
     ("x,y,z,r\n1,2,3,4\n1,2,3,-4\n", {"density": 1}, r"line 3: radius is -4; allowed is a positive number"),
     ("x,y,z,r\n1,2,3,4\n1,2,three,4\n", {"density": 1}, r"line 3: z is 'three', no number"),
-    ("x,y,z,r\n1,2,3,4\n1,2\n", {"density": 1}, r"line 3: 2 values where 4 are needed .*truncated"),
+    ("x,y,z,r\n1,2,3,4\n1,2", {"density": 1}, r"line 3: 2 values where 4 are needed .*truncated"),
+    ("x,y,z,r\n1,2,3,4\n1,2\n", {"density": 1}, r"line 3: 2 values where 4 are needed \(x y z r\)$"),
+    ("x,y,z,r\n1,2,3,4\n1,2,3,4,5", {"density": 1}, r"line 3: 5 values where 4 are needed \(x y z r\)$"),
+    ("x,y,z,r\n1,2,3,4\n", {"density": 1, "length": 0}, "length must be positive, got 0"),
+    ("x,y,z,r\n1,2,3,4\n", {"density": 1, "length": -1}, "length must be positive, got -1"),
     ("x,y,z,r\n1,2,3,4\n", {"density": 1, "type": 2}, r"type 2: has no type; its columns are x, y, z, radius"),
     ("x,y,z,r,type\n1,2,3,4,5\n", {"density": 1, "type": 2}, r"type 2: no sphere has it; there are 5"),
     ("", {}, r"bed: has no sphere"),
+    (DUMP.format("xs ys z"), {}, r"bed: line 5: xs needs ys and zs; the columns are xs, ys, z, radius, density"),
+    (DUMP.format("x ys zs"), {}, r"bed: has no x, y, z; its columns are x, ys, zs, radius, density"),
     (b"\0\1\2", {}, r"a binary file that is no VTK; .*binary2txt"),
     ("LAMMPS\n\n3 atoms\n\nAtoms # tri\n\n1 1 1\n", {}, r"line 5: atoms of style tri; allowed is one of sphere"),
 ])  # fmt: skip

@@ -52,7 +52,7 @@ class Law:
     friction: Any = coefficient(checks.not_negative)  #: of Coulomb's law
     stiffness: Any = coefficient(checks.positive_or_inf, None)  #: inf: rigid; None: what the scene needs [N/m]
     restitution: Any = coefficient(checks.between(0.0, 1.0), 0.0)  #: of impacts
-    touching: Any = coefficient(checks.between(0.0, 1.0), 1.0)  #: 0: the two never touch, and go through each other
+    touching: Any = coefficient(checks.zero_or_one, 1.0)  #: 0: the two never touch, and go through each other
 
     KEEPS: ClassVar[bool] = False  #: whether the law keeps a number of each contact
     RESISTS: ClassVar[bool] = False  #: whether it resists the turning of bodies against each other
