@@ -65,6 +65,12 @@ class Experiment:
         unit = {field.name: field.metadata.get("unit", "") for field in dataclasses.fields(self)}[name]
         raise ValueError(" ".join([name, f"{getattr(self, name):g}", *([unit] if unit else []), why]))
 
+    def refuse_idle(self, why: str, *names: str) -> None:
+        """As `refuse`, of the first of these options that does not have its default: it would have no effect."""
+        for field in dataclasses.fields(self):
+            if field.name in names and getattr(self, field.name) != field.default:
+                self.refuse(field.name, f"has no effect on {why}")
+
     def build(self) -> Scene:
         """The bodies, materials and motions at time zero."""
         raise NotImplementedError(f"scene {type(self).__name__} has no method build")

@@ -344,8 +344,8 @@ OF_FORCES, OF_DRIVES = {"free_directions", "free_turns", "held"}, {"mean_drive"}
 
 
 def refuse_ignored(motion: Motion) -> None:
-    """ValueError for a motion of a class that is not of this module, and that defines a method or a property which
-    nothing asks for: neither the program of such a motion, nor its own methods."""
+    """ValueError for what is no motion, and for a motion of a class that is not of this module, and that defines a
+    method or a property which nothing asks for: neither the program of such a motion, nor its own methods."""
     own: dict[str, Any] = {}
     for kind in reversed(type(motion).__mro__):
         if kind is not object and kind.__module__ != __name__:
@@ -358,6 +358,8 @@ def refuse_ignored(motion: Motion) -> None:
     for name in sorted(KNOWN & methods - asked):
         called, allowed = type(motion).__name__, ", ".join(sorted(asked & KNOWN))
         raise ValueError(f"the motion {called} defines {name}, which nothing asks for; allowed: {allowed}")
+    if not (isinstance(motion, Dynamic) or hasattr(motion, "pose")):
+        raise ValueError(f"the motion {motion!r}: allowed is an object of dem.motion, or one with a method pose")
 
 
 def top_speed(motion: Motion, position: Floats, reach: float) -> float:

@@ -99,6 +99,17 @@ def made(group: type[Group], values: Mapping[str, Any]) -> Group:
     return group(**values)
 
 
+def instance(group: type[Group], name: str, given: Any, of: str = "") -> Group:
+    """Return what is given for a group: it itself, a group with the values of a dict, or that of the defaults for None.
+    OptionError for anything else, with its ``name`` and what it is ``of``."""
+    if given is None or isinstance(given, Mapping):
+        given = made(group, given or {})
+        refuse_bad(given)
+    if not isinstance(given, group):
+        raise OptionError(f"{name} {given!r}: allowed{of} is a dict or a {group.__name__}")
+    return given
+
+
 def _of_meaning(group: Any, words: str) -> str:
     """As of `nearest`, the setting whose meaning begins with these words without blanks."""
     means = {f.name: f.metadata.get("help", "").replace(" ", "") for f in dataclasses.fields(group)}

@@ -56,7 +56,7 @@ from pctt.run.interrupt import uninterrupted
 from pctt.run.joints import JointNow
 from pctt.run.output import Place, Writer, described_bodies, described_forms, refuse_unwritable
 from pctt.run.overlaps import OverlapWatch
-from pctt.run.settings import Run, Settings, scene_name
+from pctt.run.settings import Run, Settings, refuse_unlike, scene_name
 from pctt.run.stepper import NewStep, NoSolutionError, Stepper
 
 
@@ -109,6 +109,7 @@ class Simulation:
         self.settings = together(
             comm, "settings", lambda: made(Settings, given).completed_for(self.experiment, compared), own=(OptionError,)
         )
+        refuse_unlike(self.settings, comm)
         scene = state.built(self.experiment, comm)
         self.dt_reason = reason(scene) if self.settings.dt is None else ""
         self.settings = self.settings.fitted(scene, compared)
@@ -135,7 +136,7 @@ class Simulation:
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
         watch = OverlapWatch(scene, self.settings, float(self.world.pairs.stiffness.min()))
         self.overlap_watch = comm.bcast(watch)  # processors may round in other ways
-        self._program, self._jumped = program, False
+        self._program, self._jumped, self._unsolved = program, False, program
         self.last: Step | None = None
         self.figures: dict[str, Any] = {}
         self.output: Writer | None = None
@@ -212,6 +213,7 @@ class Simulation:
             warn(self.comm, report.jump_words(self.figures, self._program))
         if cause := self.overlap_watch.look(made.step, self.figures["closing_speed"]):
             warn(self.comm, self.overlap_watch.words(cause, self.steps, self._program))
+        self._tell_unsolved()
         self._tell_turns()
         return self.figures
 
@@ -234,6 +236,12 @@ class Simulation:
             with log.phase("output"):
                 output.add(figures, self._row)
         self.figures = self._row | figures
+
+    def _tell_unsolved(self) -> None:
+        """Warn of the first step that is not solved; collective."""
+        if not self._unsolved and self.figures["status"] not in report.SOLVED:
+            self._unsolved = True
+            warn(self.comm, report.unsolved_words(self.figures))
 
     def _tell_turns(self) -> None:
         """Warn of a body that turns too far in a step; collective."""
@@ -478,7 +486,10 @@ class Simulation:
         if self.output is not None:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
         run = Run(output_every=every, checkpoint_every=checkpoint_every, checkpoint_minutes=checkpoint_minutes)
-        refuse_bad(run)
+        try:
+            refuse_bad(run)
+        except OptionError as error:  # as the argument is called here
+            raise OptionError(str(error).removeprefix("output_")) from None
         for name, path in {"write": folder, "problems": problems}.items():
             if path:
                 refuse_unwritable(name, Path(path), self.comm)

@@ -96,7 +96,7 @@ class Spring(Tie, Force):
         g, change, expected, highest = world.comm.bcast(found)  # processors may round in other ways
         if dt * highest >= 2.0:
             raise SceneError(
-                f"the springs {', '.join(members)[:200]} have frequencies up to {highest:.3g} rad/s: -dt {dt:g} s is "
+                f"the springs {', '.join(members)[:200]} have frequencies up to {highest:.3g} rad/s: dt {dt:g} s is "
                 f"too large for them; take less than {2.0 / highest:.3g} s, and a tenth of that to resolve them"
             )
         applied.add(world, ends, change)

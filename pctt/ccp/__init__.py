@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from dem.contact_map import BlockRows, CompactRows
-from dem.exchange import on_each, refuse
+from dem.exchange import on_each
 from pctt.arrays import Array, tangential
 from pctt.ccp.accuracy import Accuracy, figures, measure
 from pctt.ccp.cones import FrictionCones, RollingCones
@@ -31,6 +31,7 @@ from pctt.ccp.registry import MATRIX, NEWTON, SOLVERS, why_no_form, why_refused
 from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Counts, Limits, Result, Status
 from pctt.ccp.unbounded import why_indefinite, why_unanswered, why_unbounded
 from pctt.log import phase
+from pctt.options import instance
 
 __all__ = [
     "COULOMB",
@@ -62,7 +63,7 @@ def solve(
     problem: ConeProblem,
     guess: Array | None = None,
     type: str = "auto",
-    limits: Limits | None = None,
+    limits: Limits | Mapping[str, Any] | None = None,
     options: Any = None,
     newton: Newton | None = None,
     law: str = COULOMB,
@@ -81,9 +82,9 @@ def solve(
     `pctt.ccp.Operator` is for all methods but `gauss_seidel`; ValueError for a preconditioner that reads entries.
 
     ``guess`` (nc, 3) holds the last impulses of persistent contacts and zeros elsewhere; ``options`` is an instance of
-    the method's options class; ``newton``, for methods that solve Newton systems, keeps solvers and preconditioners
-    from one problem to the next; ``monitor(iterations, residual)`` is called wherever the residual is known, on every
-    rank. A problem without a solution has the status UNBOUNDED.
+    the method's options class, and ``limits`` of `Limits`, or a dict of some fields; ``newton``, for methods that solve
+    Newton systems, keeps solvers and preconditioners from one problem to the next; ``monitor(iterations, residual)`` is
+    called wherever the residual is known, on every rank. A problem without a solution has the status UNBOUNDED.
     """
     if type not in SOLVERS:
         raise ValueError(f"the solver {type!r}: allowed are {', '.join(SOLVERS)}")
@@ -97,13 +98,15 @@ def solve(
     if not problem.has_entries and SOLVERS[type].needs == MATRIX:
         allowed = ", ".join(name for name, method in SOLVERS.items() if method.needs != MATRIX)
         raise ValueError(f"the solver {type!r} reads rows of N, but N is given by its products; allowed are {allowed}")
-    limits = limits or Limits()
+    limits = instance(Limits, "limits", limits)
+    options = instance(SOLVERS[type].options, "options", options, f" for {type}")
     if monitor is not None or limits.monitor:
         watch = monitor or partial(_print, problem.comm)
         limits = dataclasses.replace(limits, watch=lambda *at: on_each(problem.comm, "monitor", lambda: watch(*at)))
     if not limits.tol > 0.0:
         raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
-    result = asked = _by(type, problem, _start(problem, guess), limits, options, newton, law)
+    start = problem.taken("a guess", problem.shown(np.zeros(problem.r.shape)) if guess is None else guess, finite=True)
+    result = asked = _by(type, problem, start, limits, options, newton, law)
     other = "conic" if asked.solver == "apgd" else "apgd"
     wrong = asked.status is Status.BREAKDOWN and other == "conic"  # products are no numbers
     hopeless = asked.final or asked.exhausted or wrong
@@ -206,23 +209,6 @@ def _states(problem: ConeProblem, g: Array, y: Array, coulomb: bool) -> NDArray[
 
 def _print(comm: MPI.Comm, iterations: int, residual: float) -> None:
     PETSc.Sys.Print(f"{iterations:5d} residual {residual:.6e}", comm=comm)
-
-
-def _start(problem: ConeProblem, guess: Array | None) -> Array:
-    """The guess in the cones (nc, 3), zero without one; ValueError on all ranks for another shape or if it is no
-    number."""
-    none = np.zeros(problem.r.shape)
-    start, wrong = problem.shown(none), ""
-    try:
-        start = start if guess is None else np.ascontiguousarray(guess, dtype=float)
-    except (TypeError, ValueError) as error:
-        wrong = f"a guess of no numbers: {error}"
-    if not np.isfinite(start).all():
-        wrong = "a guess with a NaN or an infinite number"
-    if start.shape != problem.shown(none).shape:
-        wrong = f"a guess of shape {start.shape}; allowed is {problem.shown(none).shape}"
-    refuse(problem.comm, wrong)
-    return problem.in_cones(start)
 
 
 def newton_for(comm: MPI.Comm, type: str, form: str = "auto", compare: Comparison | None = None) -> Newton:

@@ -54,8 +54,9 @@ class Accuracy:
 
 
 def measure(problem: ConeProblem, impulse: Array) -> Accuracy:
-    """Return the figures of an impulse (nc, 3), or (nc, 2) in the plane; the same on every rank."""
-    g = problem.in_cones(impulse)
+    """Return the figures of an impulse (nc, 3), or (nc, 2) in the plane; the same on every rank. ValueError for another
+    shape."""
+    g = problem.taken("impulses", impulse)
     return figures(problem, g, problem.velocity_of(problem.momentum(g)))
 
 

@@ -160,6 +160,22 @@ class ConeProblem:
         """The user's impulses (nc, 3), or (nc, 2) in the plane, of impulses g (nc, 3) in the cones."""
         return g if self.units is None else (self.units * g)[:, : self._width]
 
+    def taken(self, what: str, impulse: Any, finite: bool = False) -> Array:
+        """Impulses (nc, 3) in the cones from the user's, which may be flat. ValueError on all ranks for another shape,
+        and for what are no numbers, or no ``finite`` ones. Collective."""
+        found = none = self.shown(np.zeros(self.r.shape))
+        wrong = ""
+        try:
+            found = np.ascontiguousarray(impulse, dtype=float)
+        except (TypeError, ValueError) as error:
+            wrong = f"{what} of no numbers: {error}"
+        if finite and not np.isfinite(found).all():
+            wrong = f"{what} with a NaN or an infinite number"
+        if found.shape not in (none.shape, (none.size,)):
+            wrong = f"{what} of shape {found.shape}; allowed is {none.shape}"
+        refuse(self.comm, wrong)
+        return self.in_cones(found.reshape(none.shape))
+
     def in_cones(self, impulse: Array) -> Array:
         """Impulses (nc, 3) in the cones from the user's."""
         if self.units is None:

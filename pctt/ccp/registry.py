@@ -11,7 +11,7 @@ from pctt.ccp.cones import Cones, FrictionCones, RollingCones
 from pctt.ccp.first_order import apgd, faces, gauss_seidel, projected_steps
 from pctt.ccp.first_order.scaled import FirstOrder
 from pctt.ccp.interior import conic, pdip
-from pctt.ccp.result import Result
+from pctt.ccp.result import COULOMB, Result
 
 PRODUCT, MATRIX, NEWTON = "products with N", "rows of N", "Newton systems"
 BOTH = (FrictionCones, RollingCones)
@@ -94,3 +94,14 @@ def why_no_form(type: str, form: str) -> str:
         return ""
     allowed = ", ".join(name for name, method in SOLVERS.items() if method.has_multipliers)
     return f"{type} has no constraints with multipliers; allowed with it are contact and body, and kkt with {allowed}"
+
+
+def why_idle(type: str, form: str, law: str) -> str:
+    """As of `why_no_form`, of a form that is asked for: also if nothing would be solved in it."""
+    method = SOLVERS[type]
+    if form != "auto" and not method.newton:
+        allowed = ", ".join(name for name, other in SOLVERS.items() if other.newton)
+        return f"{type} solves no Newton systems; allowed are {allowed}"
+    if form == "contact" and law == COULOMB and method.has_law:
+        return f"{type} solves Coulomb's law in the form body alone; allowed are body, and the law relaxation"
+    return why_no_form(type, form)

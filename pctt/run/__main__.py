@@ -44,7 +44,7 @@ from pctt.run.help import help_text
 from pctt.run.interrupt import InterruptError, catch_signals
 from pctt.run.options import read_options
 from pctt.run.settings import DEMO_SOLVERS
-from pctt.run.simulate import simulate, solve_file
+from pctt.run.simulate import NotConvergedError, simulate, solve_file
 
 
 def main(comm: MPI.Comm) -> None:
@@ -103,12 +103,15 @@ def versions() -> str:
 
 
 #: Exit status by what ends a run; raised on all ranks alike.
-STATUS: dict[type[Exception], int] = {OptionError: 2, FileError: 2, SceneError: 1, InterruptError: 130}
+STATUS: dict[type[Exception], int] = {
+    OptionError: 2, FileError: 2, SceneError: 1, NotConvergedError: 3, InterruptError: 130
+}  # fmt: skip
 
 
 def run() -> int:
-    """Exit status: 0; 1 if a scene fails; 2 for a bad option or file; 130, the status of Ctrl-C in shells, if a signal
-    has ended the run. One message says what went wrong. Other errors abort all ranks."""
+    """Exit status: 0; 1 if a scene fails; 2 for a bad option or file; 3 if the problem of -problem is not
+    solved; 130, the status of Ctrl-C in shells, if a signal has ended the run. One message says what went wrong. Other
+    errors abort all ranks."""
     comm = MPI.COMM_WORLD.Dup()  # a message of a user's scene meets none of ours
     catch_signals(comm)
     try:

@@ -54,7 +54,7 @@ class Dump:
         self._hard_left, self._folder = hard, folder
         self._none = unwritten(world.pairs, world.named, world.cell.deforms)
         if folder and self._none:
-            raise OptionError(f"-dump_problem: {self._none}")
+            raise OptionError(f"problems {folder}: {self._none}")
 
     def step(
         self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result, asked: ccp.Result
@@ -112,7 +112,7 @@ class Dump:
         info = fclib.Info(
             f"{scene_name(self._experiment)}, step {self._world.step + 1}",
             f"{problem.size} contacts of {self._experiment!r}, from time {self._world.time:g} s over "
-            f"{settings.dt:g} s. {settings.solver} with -ccp_tol {settings.tol:g}: {asked.reason}, "
+            f"{settings.dt:g} s. {settings.solver} with tol {settings.tol:g}: {asked.reason}, "
             f"{asked.iterations} iterations, natural residual {asked.residual:.3g}. {stored}",
             "Solution and guess are those of Coulomb's law (mu |u_t| is added to the normal velocity)."
             if settings.law == ccp.COULOMB

@@ -18,7 +18,7 @@ from dem.together import together
 from pctt import ccp
 from pctt.ccp.newton.compare import labelled, prefix
 from pctt.ccp.newton.defaults import DEFAULTS, INCOMPLETE
-from pctt.ccp.registry import why_no_form
+from pctt.ccp.registry import why_idle
 from pctt.ksp_options import (
     OWN,
     entered,
@@ -125,17 +125,17 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, asked: Setting
     strangers = {
         name for short, name in solvers.items() if short.startswith("compare_") and not short.startswith(compared)
     }
-    strangers |= {"compare_every"} if not run.compare else set()
     own = {field.name for field in dataclasses.fields(Run)}
 
     settles = "-settle makes its state with APGD, where this option has no effect; allowed is one of the two"
     no_newton = f"-ccp_type {asked.solver} solves no Newton systems; allowed is {newton}"
-    no_form = why_no_form(asked.solver, asked.newton)
+    idle = why_idle(asked.solver, asked.newton, asked.law_for(bool(run.problem or run.compare)))
     rules: list[tuple[Any, set[str], tuple[str, ...], str]] = [  # if, which options by name or by beginning, why not
         (run.problem, OF_STEPS, ("scene_",), f"-problem {run.problem} makes no steps; allowed is one of the two"),
         (run.settle, own - OF_SETTLING | {"law", *solvers.values()}, ("ccp_",), settles),
         (not solver.newton, {"compare", "compare_every", "ccp_newton", *solvers.values()}, (), no_newton),
-        (no_form, {"ccp_newton"}, (), no_form),
+        (idle, {"ccp_newton"}, (), idle),
+        (not run.compare, {"compare_every"}, (), "has no effect without -compare; allowed is both"),
         (True, strangers, (), f"its preconditioner is not compared; -compare lists {run.compare or 'none'}"),
         (True, set(), of_others, f"belongs to another -ccp_type than {asked.solver}"),
     ]

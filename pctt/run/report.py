@@ -25,10 +25,13 @@ LARGE_OPENING, LARGE_CLOSING_WORK, LARGE_OVERLAP = 1e-3, 0.5, 0.05
 #: Tolerances above it are warned of, and why.
 LOOSE, LOOSE_BECAUSE = 2e-3, "forces of dense beds are too small by 5 to 20 % at such tolerances"
 
+#: Statuses of steps in which nothing is left to be done.
+SOLVED = {Status.CONVERGED.value, Status.SQUEEZED.value}
+
 #: Why conic does not solve a step of Coulomb's law.
 NOT_THE_LAW = (
     "no Newton systems: for Coulomb's law conic has a linear solver of its own, so apgd takes the steps; add -law "
-    "relaxation, or leave out -ksp_type, -pc_type and -ccp_newton contact"
+    "relaxation, or leave out -ksp_type and -pc_type"
 )
 
 def jump_advice(program: bool) -> str:
@@ -117,6 +120,11 @@ def jump_words(line: Mapping[str, Any], program: bool) -> str:
         f" {line['kinetic_energy [J]']:.3g} J, tenfold or out of nothing. {jump_advice(program)}. Later "
         "jumps are in the figure energy_jump of their steps"
     )
+
+
+def unsolved_words(line: Mapping[str, Any]) -> str:
+    """What is said at once of the first step from Python that is not solved; of the program every row says it."""
+    return f"step {line['step']}: {_shortfall(line)}. Later ones have converged=False among their figures"
 
 
 class Progress:

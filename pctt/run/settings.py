@@ -5,17 +5,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from numbers import Real
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Optional
 
 import numpy as np
+from mpi4py import MPI
 
 from dem.experiment import SCENE_FILE, Experiment, SceneExperiment, SceneFileError, from_file
 from dem.scene import Scene
 from dem.start import time_step
+from dem.together import first_differing_rank
 from pctt import ccp
-from pctt.ccp.registry import why_no_form, why_refused
+from pctt.ccp.registry import why_idle, why_refused
 from pctt.options import (
     AT_LEAST_ONE,
     COUNT,
@@ -23,7 +26,7 @@ from pctt.options import (
     NOT_NEGATIVE,
     POSITIVE,
     OptionError,
-    made,
+    instance,
     nearest,
     number,
     option,
@@ -142,19 +145,26 @@ class Settings(ccp.Limits):
         law = "Coulomb's law" if self.law == ccp.COULOMB else "relaxation of Coulomb's law"
         return f"{self.solver} to {self.tol:g}, {law}"
 
+    def law_for(self, relaxed: bool = False) -> str:
+        """The law that is asked for; else the relaxation with `pdip`, and where the run is ``relaxed`` by its kind, as
+        comparisons are."""
+        return self.law or (ccp.RELAXATION if relaxed or self.solver == "pdip" else ccp.COULOMB)
+
+    @property
+    def facts(self) -> tuple[dict[str, str], dict[str, float]]:
+        """What has to be alike on all ranks: words, or what else has no rounding, and numbers, by name."""
+        given = {name: value for name, value in vars(self).items() if not callable(value)}
+        numbers = {name: float(value) for name, value in given.items() if isinstance(value, Real)}
+        return {name: repr(value) for name, value in given.items() if name not in numbers}, numbers
+
     def completed_for(self, scene: Experiment, relaxed: bool = False) -> Settings:
         """The same, with what a scene and a solver have of their own where nothing is given; then ``options`` is an
-        instance. The law is the relaxation with `pdip`, and where the run is ``relaxed`` by its kind, as comparisons
-        are. OptionError for a bad value."""
+        instance. The law is that of `law_for`. OptionError for a bad value."""
         refuse_bad(self)
-        law = self.law or (ccp.RELAXATION if relaxed or self.solver == "pdip" else ccp.COULOMB)
-        if why := why_no_form(self.solver, self.newton):
+        law = self.law_for(relaxed)
+        if why := why_idle(self.solver, self.newton, law):
             raise OptionError(f"newton {self.newton}: {why}")
-        kind, options = ccp.SOLVERS[self.solver].options, self.options
-        if options is None or isinstance(options, Mapping):
-            options = made(kind, options or {})
-        if not isinstance(options, kind):
-            raise OptionError(f"options {options!r}: allowed for {self.solver} is a dict or a {kind.__name__}")
+        options: Any = instance(ccp.SOLVERS[self.solver].options, "options", self.options, f" for {self.solver}")
         refuse_bad(options)
         dt, delta = (scene.dt if self.dt is None else self.dt, scene.delta if self.delta is None else self.delta)
         whole = dataclasses.replace(self, dt=dt, delta=delta, options=options, law=law)
@@ -170,16 +180,26 @@ class Settings(ccp.Limits):
         delta = time_step.contact_distance(scene) if self.delta is None else self.delta
         resists = scene.pairs(np.inf).resists
         if why := why_refused(self.solver, ccp.RollingCones if resists else ccp.FrictionCones):
-            raise OptionError(f"-ccp_type {self.solver}: the scene has {why}")
+            raise OptionError(f"solver {self.solver}: the scene has {why}")
         if resists and self.newton == "contact":
-            raise OptionError("-ccp_newton contact: the scene has rolling or spinning resistance; allowed is body")
+            raise OptionError("newton contact: the scene has rolling or spinning resistance; allowed is body")
         if delta < scene.reach:
             allowed = f"bodies attract each other up to {scene.reach:g} m; allowed is at least that"
-            raise OptionError(f"-delta {delta:g} m: {allowed}")
+            raise OptionError(f"delta {delta:g} m: {allowed}")
         speed = self.closing_speed
         if speed is None:
             speed = math.inf if paper or delta == 0.0 or math.isinf(self.closing_work) else CLOSING * delta / dt
         return dataclasses.replace(self, dt=dt, delta=delta, stiffness=stiffness, closing_speed=speed)
+
+
+def refuse_unlike(settings: Settings, comm: MPI.Comm) -> None:
+    """OptionError on all ranks if one has other settings than the first; collective."""
+    words, numbers = settings.facts
+    if other := first_differing_rank(comm, repr(words) + repr(list(numbers)), [np.array(x) for x in numbers.values()]):
+        first, its = (comm.bcast({**words, **numbers}, rank) for rank in (0, other))
+        name = next(name for name in vars(settings) if first.get(name) != its.get(name))
+        given = f"{name} {its[name]} on rank {other}, and {first[name]} on rank 0"
+        raise OptionError(f"{given}; allowed are the same settings on all ranks")
 
 
 @dataclasses.dataclass(frozen=True)

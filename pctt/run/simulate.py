@@ -25,6 +25,10 @@ from pctt.run.state import built, settled_state
 from pctt.simulation import Simulation
 
 
+class NotConvergedError(Exception):
+    """No solver has solved the problem of a file; its figures are written. Raised on all ranks alike."""
+
+
 def simulate(options: Options, comm: MPI.Comm) -> None:
     """Run the scene of the options, or settle it with ``-settle``. InterruptError if a signal asks for the end."""
     run, progress = options.run, report.Progress(comm, options.run.quiet)
@@ -46,6 +50,9 @@ def simulate(options: Options, comm: MPI.Comm) -> None:
     ) as sim:
         if sim.restart:
             progress.say(f"from {sim.restart}: step {sim.steps}, time {sim.time:g} s")
+            if "overlap" in options.given and run.restart != "settled":  # whose command begins with a start
+                what = f"-overlap {options.given['overlap']}"
+                progress.say(f"options without effect in this run, as it goes on from a checkpoint: {what}")
         sim.write(
             run.output, overwrite=run.overwrite, every=run.output_every, checkpoint_every=run.checkpoint_every,
             checkpoint_minutes=run.checkpoint_minutes, problems=run.dump_problem,
@@ -115,7 +122,8 @@ def _how_to_go_on(options: Options, state: Path, steps: int) -> str:
 
 
 def solve_file(options: Options, comm: MPI.Comm) -> None:
-    """Solve, print the figures, and write them to summary.json in the output folder."""
+    """Solve, print the figures, and write them to summary.json in the output folder. NotConvergedError after that, if
+    the problem is not solved."""
     try:
         stored = fclib.load(options.run.problem, comm)
     except FileFormatError as error:
@@ -135,8 +143,6 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         progress.say(f"the file's {name}: {listed}")
     if compare.names:
         progress.say("\n" + report.compare_table(compare.summary()))
-    if not summary["converged"]:
-        progress.say(f"NOT CONVERGED: {summary['reason']}")
     if left := remark(options.given, newton.ksp_systems):
         progress.say(left)
     place = Place(Path(options.run.output), comm, overwrite=options.run.overwrite, program=True)
@@ -147,6 +153,8 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
         place.take()
     finally:
         place.leave()
+    if not summary["converged"]:
+        raise NotConvergedError(f"-problem {options.run.problem}: NOT CONVERGED: {summary['reason']}")
 
 
 def _solve(stored: Stored, options: Options, compare: ccp.Comparison, newton: ccp.Newton) -> dict[str, Any]:

@@ -70,7 +70,7 @@ class Stepper:
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
         if world.cell.deforms and not np.isfinite(world.pairs.stiffness).all():
-            raise OptionError("-stiffness inf: a cell of given stress needs contacts that give way; allowed is less")
+            raise OptionError("stiffness inf: a cell of given stress needs contacts that give way; allowed is less")
 
     def __enter__(self) -> Stepper:
         return self

@@ -51,6 +51,11 @@ class PlaneShear(Experiment):
 
     LAYERS: ClassVar[float] = 6.0  #: thickness of the cell of a layer, in diameters
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.layer:
+            self.refuse_idle("a layer, which starts as a lattice; allowed without the option layer", "fraction")
+
     @property
     def time(self) -> float:
         """d sqrt(rho / P), of a layer sqrt(m / (P d)) [s]."""

@@ -53,6 +53,15 @@ class Wheel(Spheres):
 
     packing = 0.6  #: share of the volume that settled spheres take
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.free:
+            self.refuse_idle("a carriage that moves freely; allowed without the option free", "slip")
+        else:
+            self.refuse_idle("a carriage that is driven; allowed with the option free", "drawbar")
+        if self.file:
+            self.refuse_idle("a wheel of a file; allowed without the option file", "bars", "thickness")
+
     @property
     def pitch(self) -> float:
         """Spacing of the lattice on which the spheres start [m]."""

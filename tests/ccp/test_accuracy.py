@@ -26,6 +26,19 @@ def test_a_sticking_contact_worked_out_by_hand():
     assert figures.velocity_norm == pytest.approx(2.0)
 
 
+def test_impulses_may_be_flat_and_have_one_shape_else():
+    known = problem(np.ones(6), [[-2, 1, 0], [-1, 0, 0]], [0.5, 0.5])
+    impulses = np.arange(6.0)
+    assert ccp.measure(known, impulses) == ccp.measure(known, impulses.reshape(2, 3))
+    by_limits = [ccp.solve(known, impulses, limits=each) for each in ({"tol": 1e-6}, ccp.Limits(1e-6))]
+    np.testing.assert_array_equal(*(result.impulse for result in by_limits))
+    for wrong in (impulses[:3], impulses.reshape(3, 2)):
+        with pytest.raises(ValueError, match=r"impulses of shape .*; allowed is \(2, 3\)"):
+            ccp.measure(known, wrong)
+    with pytest.raises(ValueError, match="impulses of no numbers"):
+        ccp.measure(known, "none")
+
+
 def test_two_contacts_worked_out_by_hand():
     """N = 1, y = g + r. First contact: g - y = -r = (1, 0, 3), projected at mu = 1 on (2, 0, 2). Second,
     without friction: -r = (-1, 4, 0), projected on the origin."""

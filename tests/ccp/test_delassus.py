@@ -85,6 +85,10 @@ def test_numbers_that_make_no_sense_are_refused():
     for words, arguments in (
         ("the solver 'newton': allowed are pdip, conic", {"type": "newton"}),
         ("the tolerance -1: allowed is a positive number", {"limits": Limits(-1)}),
+        ("tol -1: allowed is a number between 0 and 1", {"limits": {"tol": -1}}),
+        ("limits 1e-06: allowed is a dict or a Limits", {"limits": 1e-6}),
+        ("chek: no such setting; .* did you mean check", {"options": {"chek": 1}, "type": "apgd"}),
+        ("options 3: allowed for apgd is a dict or a APGD", {"options": 3, "type": "apgd"}),
         ("a guess with a NaN", {"guess": np.full_like(known.r, np.nan)}),
     ):
         with pytest.raises(ValueError, match=words):
@@ -107,8 +111,8 @@ def test_shapes_that_do_not_fit_are_refused():
     ):
         with pytest.raises(ValueError, match=words):
             ConeProblem(SELF, **{**given, **changes})
-    with pytest.raises(ValueError, match=r"a guess of shape \(120,\); allowed is \(40, 3\)"):
-        solve(ConeProblem(SELF, known.r, known.mu, G=G), np.zeros(120), type="pdip", law=RELAXATION)
+    with pytest.raises(ValueError, match=r"a guess of shape \(119,\); allowed is \(40, 3\)"):
+        solve(ConeProblem(SELF, known.r, known.mu, G=G), np.zeros(119), type="pdip", law=RELAXATION)
 
 
 @pytest.mark.parallel(2)

@@ -519,7 +519,7 @@ def test_a_crowded_body_is_refused_where_it_would_fill_the_matrix(tmp_path, crow
 
 
 def test_gauss_seidel_refuses_a_crowded_body(crowded):
-    with pytest.raises(OptionError, match="-ccp_type gauss_seidel: a body has"):
+    with pytest.raises(OptionError, match="^solver gauss_seidel: a body has"):
         ccp.solve(crowded[0], type="gauss_seidel", law=ccp.RELAXATION)
 
 

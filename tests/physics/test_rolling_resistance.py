@@ -106,10 +106,10 @@ def test_the_relaxation_opens_what_rolls():
 
 def test_other_solvers_refuse():
     for solver in set(ccp.SOLVERS) - {"auto", "apgd", "conic"}:
-        with pytest.raises(OptionError, match=f"-ccp_type {solver}: .* rolling .* allowed are conic, auto, apgd"):
+        with pytest.raises(OptionError, match=f"^solver {solver}: .* rolling .* allowed are conic, auto, apgd"):
             pctt.Simulation(on_a_plane(rolling=0.01), solver=solver)
-    with pytest.raises(OptionError, match="-ccp_newton contact: .* allowed is body"):
-        pctt.Simulation(on_a_plane(rolling=0.01), newton="contact")
+    with pytest.raises(OptionError, match="^newton contact: .* resistance; allowed is body"):
+        pctt.Simulation(on_a_plane(rolling=0.01), newton="contact", law=ccp.RELAXATION)
     with pytest.raises(ValueError, match="rolling must not be negative"):
         Scene(0.5, rolling=-1.0)
 

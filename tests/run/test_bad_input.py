@@ -59,7 +59,7 @@ BAD_OPTIONS = {
     "-steps 3 -problem p.h5": ["-problem p.h5 makes no steps"],
     "-steps 3 -settle": ["-settle makes its state with APGD"],
     "-ccp_type pdip -settle": ["-settle makes its state with APGD"],
-    "-compare_every 3": ["-compare"],
+    "-compare_every 3": ["-compare_every 3: has no effect without -compare; allowed is both"],
     "-compare_ilu_pc_factor_levels 1": ["-compare lists none"],
     "-compare_icc_pc_factor_levels 1 -compare ilu,none": ["-compare lists ilu,none"],
     "-ccp_apgd_x 1": ["did you mean"],
@@ -67,11 +67,17 @@ BAD_OPTIONS = {
     "-ccp_newton body -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
     "-ccp_newton kkt": ["auto has no constraints with multipliers", "pdip"],
     "-ccp_newton kkt -ccp_type conic": ["conic has no constraints with multipliers", "contact and body"],
+    "-ccp_newton contact": ["auto solves Coulomb's law in the form body alone; allowed are body, and the law relax"],
+    "-ccp_newton contact -ccp_type conic -law coulomb": ["conic solves Coulomb's law in the form body alone"],
     "-ccp_pdip_form quadratic -ccp_type pdip": ["quadratic", "perspective, paper"],
     "-ksp_rtol 1e-3 -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
     "-law columb": ["columb", "did you mean coulomb?"],
     "-law coulomb -settle": ["-settle makes its state with APGD"],
     "-scene_torque 0": ["0", "must be positive"],
+    "-scene_drawbar 3 -scene wheel": ["3 wheel weights has no effect on a carriage that is driven; allowed with the"],
+    "-scene_slip 0.2 -scene wheel -scene_free": ["0.2 has no effect on a carriage that moves freely; allowed without"],
+    "-scene_bars 3 -scene wheel -scene_file wheel.stl": ["3 has no effect on a wheel of a file"],
+    "-scene_fraction 0.5 -scene plane_shear -scene_layer": ["0.5 has no effect on a layer"],
     # misspelt options of PETSc
     "-pc_typ ilu": ["did you mean -pc_type?"],
     "-ksp_tpye cg -ccp_type conic": ["did you mean -ksp_type?"],
@@ -217,6 +223,13 @@ def test_options_that_had_no_effect_are_named_at_the_end(program, settled):
     assert len(said) == 1, done.stdout
     named = said[0].partition(": ")[2].split(", ")
     assert sorted(named) == sorted(f"{name} {value}" for name, value in zip(idle[::2], idle[1::2]))
+
+
+def test_a_run_that_goes_on_says_that_it_has_no_start(program, settled):
+    """It is not refused: the command of the run before goes on."""
+    words = (*SMALL, "-steps", 0, "-overlap", "relax", "-overwrite", "-restart")
+    said = program(*words, settled).stdout
+    assert "options without effect in this run, as it goes on from a checkpoint: -overlap relax\n" in said
 
 
 @pytest.mark.parametrize("solver", ["pdip", "conic"])

@@ -26,6 +26,7 @@ def falling(**law):
 
 @pytest.mark.parametrize(("shapes", "motion", "words"), [
     ([Box((1, 1, 1))], Dynamic, r"motion of 'b': the class Dynamic; allowed is one, Dynamic\(...\)"),
+    ([Box((1, 1, 1))], "Dynamic", "the motion 'Dynamic': allowed is an object of dem.motion, or one with"),
     (Box((1, 1, 1)), Dynamic(), "shapes of 'b': Box.*; allowed is a list of one or more"),
     ([], Dynamic(), "shapes of 'b': .*; allowed is a list of one or more"),
 ])  # fmt: skip
@@ -156,7 +157,41 @@ def test_overlaps_at_the_start_are_told_with_their_number_and_the_place_of_the_w
         Simulation(scene)
 
 
+@pytest.mark.parallel(2)
+@pytest.mark.parametrize(("name", "first", "other"), [
+    ("dt", 0.01, 0.02), ("stiffness", None, 1e5), ("solver", "apgd", "auto"), ("fallback", True, False),
+    ("options", {"check": 10}, {"check": 11}),
+])  # fmt: skip
+def test_other_settings_on_one_rank_are_refused_on_all(name, first, other):
+    given = {"solver": "apgd"} | {name: other if MPI.COMM_WORLD.rank else first}
+    with pytest.raises(OptionError, match=f"^{name} .* on rank 1, and .* on rank 0; allowed are the same settings"):
+        Simulation(falling(), **given)
+
+
+def test_the_first_step_that_is_not_solved_is_told():
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", UserWarning)
+        sim = Simulation(pressed(), dt=0.01, solver="apgd", max_it=1, tol=1e-8, fallback=False, overlap=0.1)
+        sim.run(steps=3)
+    assert not sim.figures["converged"]
+    (words,) = (str(each.message) for each in told)
+    assert re.match(r"step 1: NOT CONVERGED: Coulomb residual .*: 1 iterations. Later ones have converged=False", words)
+
+
+def pressed():
+    scene = Scene(0.5)
+    scene.add_spheres([[0, 0, 0.05], [0.09, 0, 0.09], [0, 0.02, 0.148]], 0.05, 1500.0)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    return scene
+
+
 def test_messages_speak_python(tmp_path):
+    with pytest.raises(OptionError, match="^every -1: allowed is a whole number >= 0"):
+        Simulation(falling()).write(tmp_path / "none", every=-1)
+    with pytest.raises(OptionError, match="^delta 0.001 m: bodies attract each other up to"):
+        Simulation(falling(cohesion=1.0, cohesion_range=0.01), delta=1e-3)
+    with pytest.raises(OptionError, match=f"^problems {tmp_path}/all: files have no rolling and spinning"):
+        Simulation(falling(rolling=0.01)).write(tmp_path / "none", problems=tmp_path / "all")
     with Simulation(falling(), dt=0.01) as sim:
         sim.write(tmp_path / "out")
         sim.step()

@@ -280,6 +280,10 @@ def test_to_import_the_package_starts_no_petsc():
         ({"solver": "apgd", "options": {"memroy": 1}}, "memroy: no such setting"),
         ({"solver": "pdip", "options": APGD()}, "options APGD.*allowed for pdip is a dict or a PDIP"),
         ({"solver": "conic", "newton": "kkt"}, "newton kkt: conic has no constraints.*allowed.*contact and body"),
+        ({"solver": "apgd", "newton": "contact"}, "newton contact: apgd solves no Newton.*are pdip, conic, auto"),
+        ({"solver": "conic", "newton": "contact"}, "newton contact: conic solves Coulomb's law in .* body alone"),
+        ({"newton": "contact"}, "newton contact: auto solves Coulomb's law in the form body alone; allowed are body"),
+        ({"delta": 1e-3, "solver": "spiral"}, "solver spiral: allowed is one of"),
         ({"law": "yes"}, "law yes: allowed is one of coulomb, relaxation"),
     ],
 )

@@ -47,7 +47,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: GaussSeid
     """Impulses from a first guess (nc, 3)."""
     if problem.has_dense_columns:
         raise OptionError(
-            f"-ccp_type gauss_seidel: a body has more than {DENSE} contacts, whose rows of N would be full; "
+            f"solver gauss_seidel: a body has more than {DENSE} contacts, whose rows of N would be full; "
             "allowed are the others"
         )
     scaled = ScaledProblem(problem)

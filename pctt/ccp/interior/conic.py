@@ -75,7 +75,7 @@ def solve(
     """Impulses, of the cone problem or of Coulomb's law; ``guess`` (nc, 3) holds those of the last step."""
     given, problem = problem, newton.begin(problem)
     if coulomb and not newton.linear.takes_unsymmetric:
-        words = "Coulomb's law needs -ccp_newton body and its own linear solver"
+        words = "Coulomb's law needs the Newton form body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
     conic = ConicProblem(problem, options, coulomb, newton.system.error_in_momenta)
     at, history, waited, least, last_gap = conic.start(guess), list[float](), 0, np.inf, np.inf
