@@ -417,9 +417,12 @@ class Scene:
                            for kind, given in (("", velocity), ("angular ", angular_velocity))])  # fmt: skip
         refuse_ignored(motion)
         _refuse_speed(name, motion, speed)
+        weights = {"density": density, "mass": mass, "inertia": inertia}
         body = LargeBody(name, tuple(shapes), motion, -1, place, turn, speed, np.inf, np.full(3, np.inf))
         if not isinstance(motion, Dynamic):
-            pass
+            weighs = [kind for kind, given in weights.items() if given is not None]
+            if weighs and isinstance(motion, Fixed):
+                raise ValueError(f"{weighs[0]} of {name!r}, which stands still: allowed is a motion, Dynamic() say")
         elif density is not None and mass is None and inertia is None:
             body = _centered(body, float(checks.positive(f"density of {name!r}", density)))
         elif density is None and mass is not None and (inertia is not None or not motion.free_turns().any()):

@@ -92,6 +92,9 @@ def _change_body(world: World, name: str, motion: Motion | None = None, **values
         motion = motions.changed(body.motion, world.time, **values) if motion is None else motion
         pose = body.position, body.quaternion
         motions.refuse_ignored(motion)
+        if _kind(body, type(motion).__name__) is not type(motion):
+            kinds = ", ".join(dict.fromkeys([type(body.motion).__name__, *motions.KINDS]))
+            raise ValueError(f"body {name!r} cannot change its motion to {motion!r}: allowed are {kinds}")
         _refuse_other_freedoms(body, motion)
         if not isinstance(motion, Dynamic):
             pose = _leading_to(motion, world.time, world.large.position[row], world.large.quaternion[row])
@@ -164,11 +167,16 @@ def _entry(body: LargeBody) -> dict[str, Any]:
     return {"motion": kind, "values": values, **pose, "surface": body.surface}
 
 
+def _kind(body: LargeBody, name: str) -> type | None:
+    """The class of motions of this name that a checkpoint of the body may have: its own, or one of `dem.motion`."""
+    own = type(body.motion)
+    return own if own.__name__ == name else motions.KINDS.get(name)
+
+
 def _restored(body: LargeBody, entry: Mapping[str, Any]) -> LargeBody:
     """The body as an entry has it: its motion is one of `dem.motion` or that of the scene, with parameters that it has,
     by which the body can move, and the pose is one."""
-    own, name = type(body.motion), body.name
-    kind = own if own.__name__ == entry["motion"] else motions.KINDS.get(entry["motion"])
+    name, kind = body.name, _kind(body, entry["motion"])
     if kind is None:
         raise ValueError(f"body {name!r}: neither the scene nor dem.motion has the motion {entry['motion']}")
     if strange := sorted({*entry["values"]} - {field.name for field in dataclasses.fields(kind)}):

@@ -20,7 +20,7 @@ from dem.scene import LargeBody, Scene
 from dem.shapes import Plane
 from dem.start.falls import fall
 from dem.start.pressing import pressing
-from dem.start.turns import TURN, turning_of_large
+from dem.start.turns import TURN, held_beside, turning_of_grains, turning_of_large
 
 DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/choose.md has the errors of forces
 FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
@@ -108,9 +108,11 @@ def fastest_grain(scene: Scene) -> float:
 
 
 def fastest_turn(scene: Scene) -> float:
-    """Return the greatest angular speed at time zero of a body that is no sphere and that forces move [rad/s]."""
+    """Return the greatest angular speed at time zero of a body that forces move and that is no sphere, or that is held
+    beside its centre [rad/s]."""
     grains, large = bodies.turning(scene.expected()), turning_of_large(scene.large(), scene.large_bodies)
-    return float(np.concatenate([grains, large]).max(initial=0.0))
+    held = [turning_of_grains(scene.row(id), [id]) for id in held_beside(scene.named)]
+    return float(np.concatenate([grains, large, *held]).max(initial=0.0))
 
 
 def _fall(scene: Scene) -> float:

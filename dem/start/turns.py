@@ -1,19 +1,21 @@
 """How far bodies turn in a step that are no spheres: a step has to resolve it.
 
-The angular momentum of such a body depends on its orientation, and so do the places where it touches others. Errors are
-of second order in the angle of a step. Spheres may turn as fast as they will.
+The angular momentum of such a body depends on its orientation, and so do the places where it touches others, or where a
+joint or spring holds it. Errors are of second order in the angle of a step. Spheres may turn as fast as they will, if
+they are not held beside their centres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats
 from dem.exchange import greatest
+from dem.parts.ends import Tie
 from dem.shapes import Sphere
 
 if TYPE_CHECKING:
@@ -30,6 +32,22 @@ def turning_of_large(table: bodies.Bodies, members: Sequence[LargeBody]) -> Floa
     return bodies.turning(table) * np.array([not _is_ball(body) for body in members], float)
 
 
+def held_beside(named: Mapping[str, Mapping[str, Any]]) -> list[int]:
+    """The ids of the grains that joints and springs among these parts hold beside their centres."""
+    ties = [tie for members in named.values() for tie in members.values() if isinstance(tie, Tie)]
+    ends = [(end, np.any(anchor)) for tie in ties for end, anchor in zip(tie.ends, tie.anchors)]
+    return sorted({end for end, beside in ends if isinstance(end, int) and beside})
+
+
+def turning_of_grains(grains: bodies.Bodies, held: Sequence[int]) -> Floats:
+    """`dem.bodies.turning` of grains (n,), also of spheres whose ids are among those `held_beside` [rad/s]."""
+    speeds = bodies.turning(grains)
+    if held:
+        rows = np.isin(grains.id, held).nonzero()[0]
+        speeds[rows] = np.linalg.norm(grains.velocity[rows, 3:], axis=1)
+    return speeds
+
+
 def _is_ball(body: LargeBody) -> bool:
     balls = all(isinstance(shape, Sphere) and not np.any(shape.center) for shape in body.shapes)
     return balls and bool(np.ptp(body.inertia) <= 1e-9 * body.inertia.max())
@@ -40,12 +58,16 @@ class TurnWatch:
 
     def __init__(self) -> None:
         self._times, self._last, self._told = STEADY - 1, -1, False
+        self._held: list[int] | None = None
 
     def look(self, world: World, dt: float) -> str:
         """What to say of a dt [s] for the world as it is now, most often nothing; collective."""
-        if self._told or not world.turns_unlike_spheres:
+        if self._held is None:
+            self._held = held_beside(world.named)
+        if self._told or not (world.turns_unlike_spheres or self._held):
             return ""
-        speeds = np.concatenate([bodies.turning(world.grains), turning_of_large(world.large, world.large_bodies)])
+        of_grains = turning_of_grains(world.grains, self._held)
+        speeds = np.concatenate([of_grains, turning_of_large(world.large, world.large_bodies)])
         ids = np.concatenate([world.grains.id, world.large.id])
         row = int(np.argmax(speeds)) if len(speeds) else -1
         mine = (float(speeds[row]), int(ids[row])) if len(speeds) else (0.0, -1)

@@ -329,10 +329,13 @@ def write_local(
 
     W is that of rigid contacts; the compliance is kept outside the groups of FCLIB. Raises OSError on all ranks if
     the file cannot be written, ValueError if a body has so many contacts that it would fill W, or contacts have
-    moments.
+    moments or two friction coefficients.
     """
     if problem.cones.parts > 1:
         raise ValueError(f"the problem has {problem.cones.what}, which is read but not written")
+    elliptic = problem.units is not None and bool(((problem.units != 1.0) & (problem.units != 0.0)).any())
+    if problem.max(float(elliptic)):
+        raise ValueError("the problem has two friction coefficients a contact; allowed in FCLIB is one")
     if problem.has_dense_columns:
         raise ValueError(f"a body has more than {DENSE} contacts and would fill N; allowed is fclib.write_global")
     N = problem.rigid_matrix()

@@ -267,6 +267,18 @@ def test_jumps_are_told_once_in_the_language_of_the_door(monkeypatch, program, w
     assert [words in str(one.message) for one in told] == [True]
 
 
+@pytest.mark.parametrize("damping", [0.0, 5.0])
+@pytest.mark.parametrize("dt", [0.01, 0.003])
+def test_a_bob_on_a_slow_spring_is_no_jump(dt, damping):
+    """Gravity and spring work on the same velocities, also where the bob turns back."""
+    scene = Scene(0.5)
+    (bob,) = scene.add_spheres([0, 0, 0], 0.1, 1000.0)
+    scene.add_spring("spring", None, bob, anchor=(0, 0, 0.5), stiffness=400.0, length=0.5, damping=damping)
+    jumps = []
+    pctt.Simulation(scene, dt=dt).run(until=5.0, call=lambda sim: jumps.append(sim.figures["energy_jump"]))
+    assert max(jumps) == 0.0
+
+
 def test_a_swing_on_the_springs_is_no_jump():
     """A column that falls by less than a thousandth of a radius: its energy rises tenfold, and is next to nothing."""
     scene = on_floor()

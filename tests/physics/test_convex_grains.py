@@ -25,6 +25,39 @@ def on_floor(floor, friction, slope=0.0, way=0.0):
     return scene
 
 
+def energies(scene, seconds):
+    """Kinetic and potential energy at the first step and at the end, by the defaults."""
+    with pctt.Simulation(scene) as sim:
+        sim.step()
+        first = sim.figures["kinetic_energy [J]"] + sim.figures["potential_energy [J]"]
+        sim.run(until=seconds)
+        return first, sim.figures["kinetic_energy [J]"] + sim.figures["potential_energy [J]"]
+
+
+@pytest.mark.parametrize(("radius", "height", "tilt"), [(0.012, 0.002, 20.0), (0.1, 0.004, 15.0), (0.1, 0.02, 25.0)])
+def test_a_wobbling_coin_keeps_its_energy(radius, height, tilt):
+    """It rolls on its rim, without slip: nothing brakes it."""
+    tilt = np.radians(tilt)
+    across, turn = np.array([np.cos(tilt), 0, -np.sin(tilt)]), (np.cos(tilt / 2), 0, np.sin(tilt / 2), 0)
+    spin = 2 * np.sqrt(G / (radius * np.sin(tilt))) * np.sin(tilt) * across
+    place = np.array([0, 0, radius * np.sin(tilt)]) + height / 2 * np.array([np.sin(tilt), 0, np.cos(tilt)])
+    scene = on_floor("plane", 0.5)
+    scene.add_grains(place, Cylinder(radius, height), 2000.0, quaternions=turn, angular_velocity=spin)
+    first, last = energies(scene, 20 * np.sqrt(radius / G))
+    assert last == pytest.approx(first, rel=0.06)
+
+
+@pytest.mark.parametrize("radii", [(0.03, 0.03, 0.015), (0.2, 0.1, 0.1), (0.05, 0.03, 0.03)])
+def test_an_ellipsoid_rocks_without_loss(radii):
+    tilt = 0.5
+    scene = on_floor("plane", 0.5)
+    place = [0, 0, np.hypot(radii[0] * np.sin(tilt), radii[2] * np.cos(tilt))]
+    turn = (np.cos(tilt / 2), 0, np.sin(tilt / 2), 0)
+    scene.add_grains(place, Superellipsoid(radii), 2000.0, quaternions=turn)
+    first, last = energies(scene, 20 * np.sqrt(max(radii) / G))
+    assert last == pytest.approx(first, rel=0.01)
+
+
 @pytest.mark.parametrize("floor", FLOORS)
 def test_a_cylinder_rolls_down_at_two_thirds_of_what_slides(floor):
     slope, r = 0.4, 0.12

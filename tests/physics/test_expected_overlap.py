@@ -9,6 +9,7 @@ import pytest
 from mpi4py import MPI
 
 import pctt
+from dem.mesh import Mesh
 from dem.motion import Dynamic, Guided
 from dem.scene import Scene
 from dem.shapes import Box, Plane
@@ -32,6 +33,15 @@ def deepest(scene: Scene, half: float, seconds: float, **settings) -> tuple[floa
         worst = [0.0]
         sim.run(until=seconds, call=lambda sim: worst.append(sim.figures["worst_overlap"]))
         return max(worst) / half, sim.expected_overlap
+
+
+def test_a_flat_mesh_is_no_thin_body():
+    scene, corners = Scene(0.5), [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+    scene.add_body("floor", [Mesh(np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]))])
+    scene.add_body("box", [Box((0.05, 0.05, 0.05))], Dynamic(), density=1000.0, position=(0, 0, 0.07))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pctt.Simulation(scene).run(until=0.3)
 
 
 @pytest.mark.parametrize(

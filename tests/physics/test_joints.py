@@ -242,6 +242,21 @@ def test_a_ball_without_weight_is_held_from_the_first_step_on():
     assert np.linalg.norm(sim.positions[0]) == pytest.approx(0.05, rel=1e-6)
 
 
+@pytest.mark.parametrize("spin", [200.0, 400.0])
+def test_a_spinning_ball_on_a_joint_nods_as_deep_as_it_should(spin):
+    """The default step resolves the spin of a sphere that is held beside its centre. At the lowest point of its arm, with
+    the moments A about the joint and C about the arm, sin / cos^2 = 2 A m g r / (C w)^2, by energy and momentum."""
+    scene, r = Scene(0.3), 0.05
+    (ball,) = scene.add_spheres([r, 0, 0], r, 1000.0, angular_velocity=(spin, 0, 0))
+    scene.add_joint("pin", None, ball, kind="ball", anchor=(0, 0, 0))
+    with pctt.Simulation(scene) as sim:
+        depth = []
+        sim.run(until=0.5, call=lambda sim: depth.append(-sim.positions[0, 2] / r))
+        assert sim.settings.dt * spin <= 0.2 + 1e-9
+    x = 2 * 1.4 * r**2 * G * r / (0.4 * r**2 * spin) ** 2
+    assert max(depth) == pytest.approx((np.sqrt(1 + 4 * x**2) - 1) / (2 * x), rel=2e-3)
+
+
 def test_a_weak_motor_stalls_at_its_torque_and_its_work_is_in_the_balance():
     sim = simulation(wheel(speed=100.0, strength=0.2))
     moment = sim.local.inertia[0, 0]

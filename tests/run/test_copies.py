@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import pickle
+import signal
 
 import numpy as np
 import pytest
 from mpi4py import MPI
 
 from pctt import Box, Hinged, Plane, Scene, Simulation
+from pctt.folder import Folder
 from pctt.options import OptionError
 from pctt.run import stepper
 
@@ -100,6 +102,22 @@ def test_ctrl_c_in_a_step_leaves_the_state_before_it(monkeypatch, where):
     for each in (sim, other):
         each.run(steps=4)
     assert_same(sim, other)
+
+
+def test_ctrl_c_while_files_are_written_waits_for_them(monkeypatch, tmp_path):
+    sim, other = begun(), begun()
+    sim.write(tmp_path / "run")
+    record = sim.output.record
+    with monkeypatch.context() as patch:
+        patch.setattr(sim.output, "record", lambda *given: (signal.raise_signal(signal.SIGINT), record(*given)))
+        with pytest.raises(KeyboardInterrupt):
+            sim.run(steps=3)
+    assert sim.steps == 13
+    sim.run(steps=2)
+    other.run(steps=3)
+    assert_same(sim, other)
+    assert Folder(tmp_path / "run").records()["step"].tolist() == [13, 14, 15]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_bare_number_is_neither_steps_nor_seconds():

@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 
 import pctt
-from pctt import Box, Dynamic, Plane, Scene, Simulation
+from pctt import Box, Dynamic, Fixed, Plane, Scene, Simulation
 from pctt.disk import FileError
 from pctt.options import OptionError
 from pctt.scenes import Mixer
@@ -29,6 +29,7 @@ def falling(**law):
     ([Box((1, 1, 1))], "Dynamic", "the motion 'Dynamic': allowed is an object of dem.motion, or one with"),
     (Box((1, 1, 1)), Dynamic(), "shapes of 'b': Box.*; allowed is a list of one or more"),
     ([], Dynamic(), "shapes of 'b': .*; allowed is a list of one or more"),
+    ([Box((1, 1, 1))], Fixed(), r"density of 'b', which stands still: allowed is a motion, Dynamic\(\) say"),
 ])  # fmt: skip
 def test_a_body_of_a_class_or_of_no_list_is_refused(shapes, motion, words):
     with pytest.raises(ValueError, match=words):
@@ -50,8 +51,15 @@ def test_a_time_that_is_past_is_no_end():
     sim.run(until=0.05)
     sim.run(until=sim.time)
     assert sim.steps == 5
-    with pytest.raises(OptionError, match=r"run\(until=0.02\): the time is 0.05 s already; allowed is a later one"):
-        sim.run(until=0.02)
+    for past in (0.02, -np.inf, np.nan):
+        words = rf"run\(until={past}\): the time is 0.05 s already; allowed is a later one"
+        with pytest.raises(OptionError, match=words):
+            sim.run(until=past)
+    sim.run(until=np.inf, stop=lambda sim: sim.steps == 7)
+    for every in (0, -1, 2.5):
+        with pytest.raises(OptionError, match=rf"run\(every={every}\): allowed are whole numbers from 1 on"):
+            sim.run(steps=1, every=every)
+    assert sim.steps == 7
 
 
 def test_unused_materials_and_rolling_of_more_than_a_radius_are_told():
