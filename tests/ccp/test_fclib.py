@@ -296,6 +296,14 @@ def test_bilateral_constraints_are_refused(tmp_path, name):
         fclib.read(path, SELF)
 
 
+def test_a_problem_with_two_friction_coefficients_is_not_written(tmp_path):
+    known = heap(0, 12, 8)[0]
+    elliptic = ConeProblem(SELF, known.r, np.stack([known.mu, 0.5 * known.mu], axis=1), N=known.N)
+    with pytest.raises(ValueError, match="two friction coefficients a contact; allowed in FCLIB is one"):
+        fclib.write_local(tmp_path / "local.hdf5", elliptic)
+    assert not (tmp_path / "local.hdf5").exists()
+
+
 def set_(name: str, value):
     def change(file: h5py.File) -> None:
         if name in file:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -65,6 +66,16 @@ def test_what_is_changed_is_kept_and_restored():
     assert again.large_bodies[1].motion == Glide((1, 0, 0))
 
 
+@dataclass(frozen=True)
+class Wobbling:
+    """A motion of a user, which no checkpoint could name where the scene does not have it."""
+
+    way: float
+
+    def pose(self, time, position, orientation):
+        return position + [0, 0, self.way * np.sin(time)], orientation
+
+
 REFUSED = {
     "lod wind": ({}, "'lod wind': allowed are load, .* did you mean load"),
     "load wnd": ({"force": (0, 0, 1)}, "no load 'wnd'; there are: wind, drag; did you mean wind.*on=... to begin"),
@@ -76,6 +87,7 @@ REFUSED = {
     "joint axle": ({"low": 3.0, "high": 2.0}, "limits of a joint"),
     "source rain": ({"radius": 1.0}, "source 'rain': radius cannot be set; allowed are mass_rate, number_rate"),
     "body blt": ({"motion": Glide((1, 0, 0))}, "no large body 'blt'; there are: arm, belt; did you mean belt"),
+    "body belt": ({"motion": Wobbling(1.0)}, r"cannot change its motion to Wobbling\(.*: allowed are .*Fixed.*Glide"),
     "body arm": ({"motion": Glide((1, 0, 0))}, "cannot change its motion"),
     "body belt": ({"motion": Glide((1, 0, 0)), "velocity": (1, 0, 0)}, "a motion, or parameters of the present one"),
     "cell": ({"stres": (None, None, 1.0)}, "cell: stres cannot be set; .* did you mean stress"),

@@ -244,8 +244,8 @@ def test_a_ball_without_weight_is_held_from_the_first_step_on():
 
 @pytest.mark.parametrize("spin", [200.0, 400.0])
 def test_a_spinning_ball_on_a_joint_nods_as_deep_as_it_should(spin):
-    """The default step resolves the spin of a sphere that is held beside its centre. At the lowest point of its arm, with
-    the moments A about the joint and C about the arm, sin / cos^2 = 2 A m g r / (C w)^2, by energy and momentum."""
+    """The default step resolves the spin of a sphere that is held beside its centre. At the lowest point of its arm,
+    with the moments A about the joint and C about the arm, sin / cos^2 = 2 A m g r / (C w)^2 (energy and momentum)."""
     scene, r = Scene(0.3), 0.05
     (ball,) = scene.add_spheres([r, 0, 0], r, 1000.0, angular_velocity=(spin, 0, 0))
     scene.add_joint("pin", None, ball, kind="ball", anchor=(0, 0, 0))
