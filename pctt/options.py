@@ -12,7 +12,7 @@ import numbers
 import sys
 import typing
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, TypeVar
 
 from dem.checks import nearest
@@ -104,9 +104,12 @@ def instance(group: type[Group], name: str, given: Any, of: str = "") -> Group:
     OptionError for anything else, with its ``name`` and what it is ``of``."""
     if given is None or isinstance(given, Mapping):
         given = made(group, given or {})
-        refuse_bad(given)
     if not isinstance(given, group):
         raise OptionError(f"{name} {given!r}: allowed{of} is a dict or a {group.__name__}")
+    try:
+        _refuse_bad_once(given)
+    except TypeError:  # an array has no hash
+        refuse_bad(given)
     return given
 
 
@@ -126,6 +129,8 @@ def refuse_bad(group: Any) -> None:
                 raise OptionError(f"{f.name} {value!r}: allowed is {_allowed(kind, f.metadata)}")
             _refuse(f"{f.name} {value}", value, kind, f.metadata)
 
+
+_refuse_bad_once = lru_cache(64)(refuse_bad)  #: steps ask for the same again and again
 
 _hints: Callable[[Any], dict[str, Any]] = cache(typing.get_type_hints)
 

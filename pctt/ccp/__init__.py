@@ -103,8 +103,6 @@ def solve(
     if monitor is not None or limits.monitor:
         watch = monitor or partial(_print, problem.comm)
         limits = dataclasses.replace(limits, watch=lambda *at: on_each(problem.comm, "monitor", lambda: watch(*at)))
-    if not limits.tol > 0.0:
-        raise ValueError(f"the tolerance {limits.tol}: allowed is a positive number")
     start = problem.taken("a guess", problem.shown(np.zeros(problem.r.shape)) if guess is None else guess, finite=True)
     result = asked = _by(type, problem, start, limits, options, newton, law)
     other = "conic" if asked.solver == "apgd" else "apgd"

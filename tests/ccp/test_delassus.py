@@ -84,7 +84,7 @@ def test_numbers_that_make_no_sense_are_refused():
     problem = from_graph(known, graph)
     for words, arguments in (
         ("the solver 'newton': allowed are pdip, conic", {"type": "newton"}),
-        ("the tolerance -1: allowed is a positive number", {"limits": Limits(-1)}),
+        ("tol -1: allowed is a number between 0 and 1", {"limits": Limits(-1)}),
         ("tol -1: allowed is a number between 0 and 1", {"limits": {"tol": -1}}),
         ("limits 1e-06: allowed is a dict or a Limits", {"limits": 1e-6}),
         ("chek: no such setting; .* did you mean check", {"options": {"chek": 1}, "type": "apgd"}),
