@@ -490,6 +490,8 @@ class Simulation:
             refuse_bad(run)
         except OptionError as error:  # as the argument is called here
             raise OptionError(str(error).removeprefix("output_")) from None
+        if not isinstance(hard, (int, np.integer)) or hard < 0:
+            raise OptionError(f"write(hard={hard}): allowed are whole numbers from 0 on")
         for name, path in {"write": folder, "problems": problems}.items():
             if path:
                 refuse_unwritable(name, Path(path), self.comm)

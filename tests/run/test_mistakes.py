@@ -196,6 +196,9 @@ def pressed():
 def test_messages_speak_python(tmp_path):
     with pytest.raises(OptionError, match="^every -1: allowed is a whole number >= 0"):
         Simulation(falling()).write(tmp_path / "none", every=-1)
+    for hard in (-1, 1.5):
+        with pytest.raises(OptionError, match=rf"write\(hard={hard}\): allowed are whole numbers from 0 on"):
+            Simulation(falling()).write(tmp_path / "none", hard=hard)
     with pytest.raises(OptionError, match="^delta 0.001 m: bodies attract each other up to"):
         Simulation(falling(cohesion=1.0, cohesion_range=0.01), delta=1e-3)
     with pytest.raises(OptionError, match=f"^problems {tmp_path}/all: files have no rolling and spinning"):
