@@ -92,12 +92,12 @@ def _change_body(world: World, name: str, motion: Motion | None = None, **values
         motion = motions.changed(body.motion, world.time, **values) if motion is None else motion
         pose = body.position, body.quaternion
         motions.refuse_ignored(motion)
-        if _kind(body, type(motion).__name__) is not type(motion):
-            kinds = ", ".join(dict.fromkeys([type(body.motion).__name__, *motions.KINDS]))
-            raise ValueError(f"body {name!r} cannot change its motion to {motion!r}: allowed are {kinds}")
         _refuse_other_freedoms(body, motion)
         if not isinstance(motion, Dynamic):
             pose = _leading_to(motion, world.time, world.large.position[row], world.large.quaternion[row])
+        if _kind(body, type(motion).__name__) is not type(motion):
+            kinds = ", ".join(dict.fromkeys([type(body.motion).__name__, *motions.KINDS]))
+            raise ValueError(f"body {name!r} cannot change its motion to {motion!r}: allowed are {kinds}")
         body = dataclasses.replace(body, motion=motion, position=pose[0], quaternion=pose[1])
     world.replace_large(body)
 

@@ -153,8 +153,8 @@ class Joint(Constraint):
                 raise ValueError(f"joint {name!r}: {body.name!r} has a drive of its own; allowed are other motions")
         joint = cls(ends, anchors, frames=frames, **given)
         if not joint.low <= 0.0 <= joint.high:
-            given = f"{joint.low:g} to {joint.high:g}"
-            raise ValueError(f"limits of {name!r}, {given}: allowed are those about 0, where it is at time zero")
+            span = f"{joint.low:g} to {joint.high:g}"
+            raise ValueError(f"limits of {name!r}, {span}: allowed are those about 0, where it is at time zero")
         if (count := KINDS[joint.kind].axes) != 1 + len(more):
             raise ValueError(f"axes of {name!r}: got {1 + len(more)}, allowed are {count} of a {joint.kind} joint")
         return joint

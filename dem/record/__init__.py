@@ -140,7 +140,8 @@ def energy_balance(step: Step) -> dict[str, float]:
         belts = -np.vdot(step.impulse[:, 1:], system.surface)
     if system.drift is not None:
         flow = -np.vdot(step.impulse, system.drift)
-    falling = sum(0.5 * system.dt * world.gravity @ (_momentum(x) + _momentum(y)) for x, y in zip(before[:own], after))
+    momenta = sum(_momentum(table) for table in (*before[:own], *after[:own]))
+    falling = 0.5 * system.dt * float(world.gravity @ momenta)
     whole = _summed(
         comm, kinetic_before=was[0], potential_before=was[1], kinetic=now[0], potential=now[1], falling=falling,
         normal=normal, tangential=tangential, elastic=elastic, elastic_at_end=elastic_at_end, strained=strained,
