@@ -94,7 +94,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     linear is found by a fixed-point iteration, whose error falls by about the angle of a step each time: the angular
     momentum of bodies that are no spheres, and the errors of constraints at the end of the step. So they hold there, as
     in the method SHAKE, with forces of the start of the step, and energy does not drift (Hairer, Lubich, Wanner,
-    "Geometric Numerical Integration", section VII.1.4)."""
+    "Geometric Numerical Integration", section VII.1.4). Near dead points it diverges, and the best round counts."""
     row, geometry = ends.row, _geometry(parts, ends.row, cell)
     found = geometry(ends.position, ends.quaternion)
     count, every = len(ends.free), [part for _, members in parts for part in members]
@@ -105,9 +105,9 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
         np.add.at(J, (np.arange(len(t)), row[which, side]), along[which, coordinates, side])
     root = _roots(ends.inverse_mass)
     B = np.einsum("knx,nxy->kny", J, root).reshape(len(t), -1)
-    now, velocity = J.reshape(len(t), -1) @ ends.velocity.ravel(), ends.free.copy()
-    A, held = B @ B.T, kind == HELD
-    left = _braked(A, t, bound, np.abs(way), held, now, J.reshape(len(t), -1) @ ends.free.ravel(), dt)
+    A, held, flat = B @ B.T, kind == HELD, J.reshape(len(t), -1)
+    now = flat @ ends.velocity.ravel()
+    left = _braked(A, t, bound, np.abs(way), held, now, flat @ ends.free.ravel(), dt)
     slip = np.maximum(DROOP * np.abs(left), np.abs(left - now))
     motors = np.isfinite(bound)
     slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
@@ -120,7 +120,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
         change = np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
         spun, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.spin_change[rows])
         spin[rows] = velocity[rows, 3:] = spun + ends.spin_change[rows]
-        free = J.reshape(len(t), -1) @ velocity.ravel()
+        free = flat @ velocity.ravel()
         for _ in range(2 * len(t) + 1):
             g = _impulses(A, t, free, on, saturated)
             wrong = _wrong(kind, t, bound, on, g, free + A @ g, 0.0)
@@ -132,7 +132,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
             expected = push.ravel() + B.T @ _impulses(A, t, free + pushed, on, saturated)
         differs = np.abs(expected - last).max()
         if number and differs >= least:
-            break  # at a dead point it diverges: the best round counts
+            break
         best = t, free, on, saturated, spin, middle
         if number:
             least = differs
@@ -144,7 +144,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
             break
         place, turn = ends.position + dt * after[:, :3], quaternion.integrate(ends.quaternion, after, dt)
         error = geometry(place, turn).error
-        bent = (error - found.error)[which, coordinates] / dt - J.reshape(len(t), -1) @ after.ravel()
+        bent = (error - found.error)[which, coordinates] / dt - flat @ after.ravel()
         t = np.where(held, left - bent, left)
     t, free, on, saturated, spin, middle = best
     fixed = (J, B, root, which, coordinates, kind, t, bound, free, slip, found.axes)
