@@ -267,15 +267,16 @@ def find_turned(
 def _corrected(
     contacts: Contacts, found: Contacts, deeper: Floats, tried: int, near: float
 ) -> tuple[Contacts, Contacts]:
-    """The contacts, whose gaps are corrected where `found` has them again by how much they are `deeper` (n,) at the end
-    of the step than foreseen, and what is found beside them: with another normal, deeper by more than `near` [m], or of
-    bodies with corners, where it was `tried` before, at a point further off than that.
+    """The contacts, whose gaps with large bodies are corrected where `found` has them again by how much they are
+    `deeper` (n,) at the end of the step than foreseen, and what is found beside them: with another normal, deeper by
+    more than `near` [m], or of bodies with corners, where it was `tried` before, at a point further off than that.
 
     What stays has the arms of the start of the step: with those of the end each step would brake a body that rolls,
-    rocks or wobbles (see `dem.contact.ahead`)."""
-    place = places(contacts.key, found.key)
-    same = place >= 0
-    at, own, shape = place[same], found.take(same), found.near.bodies.shape
+    rocks or wobbles (see `dem.contact.ahead`). Between two grains, which both turn, corrections alone do not converge
+    in a few tries: beds of mixed shapes would overlap four times as deep."""
+    place, shape = places(contacts.key, found.key), found.near.bodies.shape
+    same = (place >= 0) & (shape[found.b] == COMPOUND)
+    at, own = place[same], found.take(same)
     alike = (np.einsum("ci,ci->c", contacts.normal[at], own.normal) >= ALIKE) & (deeper[same] > -near)
     if tried:
         curved = (shape != BOX) & (shape != COMPOUND) & ((shape < POLYHEDRON) | (shape >= CONVEX))
