@@ -276,12 +276,11 @@ def _corrected(
     in a few tries: beds of mixed shapes would overlap four times as deep."""
     place, shape = places(contacts.key, found.key), found.near.bodies.shape
     same = (place >= 0) & (shape[found.b] == COMPOUND)
-    at, own = place[same], found.take(same)
+    at, own, shape = place[same], found.take(same), shape[found.a[same]]
     alike = (np.einsum("ci,ci->c", contacts.normal[at], own.normal) >= ALIKE) & (deeper[same] > -near)
     if tried:
-        curved = (shape != BOX) & (shape != COMPOUND) & ((shape < POLYHEDRON) | (shape >= CONVEX))
-        moved = quaternion.length(contacts.point[at] - own.point) > near
-        alike &= curved[own.a] | curved[own.b] | ~moved
+        corners = (shape == BOX) | (shape == COMPOUND) | ((shape >= POLYHEDRON) & (shape < CONVEX))
+        alike &= ~corners | (quaternion.length(contacts.point[at] - own.point) <= near)
     same[same] = alike
     linear = contacts.linear_gap.copy()
     linear[place[same]] += deeper[same]

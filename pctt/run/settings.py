@@ -165,7 +165,6 @@ class Settings(ccp.Limits):
         if why := why_idle(self.solver, self.newton, law):
             raise OptionError(f"newton {self.newton}: {why}")
         options: Any = instance(ccp.SOLVERS[self.solver].options, "options", self.options, f" for {self.solver}")
-        refuse_bad(options)
         dt, delta = (scene.dt if self.dt is None else self.dt, scene.delta if self.delta is None else self.delta)
         whole = dataclasses.replace(self, dt=dt, delta=delta, options=options, law=law)
         refuse_bad(whole)
