@@ -27,8 +27,10 @@ def profile(sample: Sample, axis: ArrayLike, edges: ArrayLike) -> Profile:
     """Return what is where along a direction `axis` (3,), in bins between the ascending `edges` (bins + 1,) [m].
 
     Along an axis with a period the edges may go on beyond the cell, with images of its grains; along other directions
-    each grain counts once. ValueError for an axis that is no direction."""
+    each grain counts once. ValueError for an axis that is no direction, and edges that do not ascend."""
     edge, along = np.asarray(edges, float), _direction(axis)
+    if edge.ndim != 1 or len(edge) < 2 or not (np.diff(edge) >= 0.0).all():
+        raise ValueError(f"edges {edges!r}: allowed are two or more numbers, none below the one before")
     own = np.abs(along) > 1.0 - 1e-12
     ends = np.where(own[:, None], np.sort(np.sum(along * own) * edge[[0, -1]]), [-np.inf, np.inf])
     repeated = replace(sample, lattice=sample.lattice * own[:, None])

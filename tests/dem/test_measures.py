@@ -175,6 +175,12 @@ def test_an_axis_of_a_profile_that_is_no_direction_is_refused(axis):
         measures.profile(column(), axis, [0, 1])
 
 
+@pytest.mark.parametrize("edges", [[0.3, 0.2, 0.0], [0.1], [[0, 1], [1, 2]], [0, np.nan]])
+def test_edges_of_a_profile_that_do_not_ascend_are_refused(edges):
+    with pytest.raises(ValueError, match=r"edges .*: allowed are two or more numbers, none below the one before"):
+        measures.profile(column(), (0, 0, 1), edges)
+
+
 def test_a_profile_of_a_shear_flow():
     position = np.array([[0, 0, 0.05], [0, 0, 0.05], [0, 0, 0.15], [0, 0, 0.35]])
     data = sample(position, velocity=np.concatenate([position[:, ::-1], np.zeros((4, 3))], axis=1))
@@ -183,6 +189,7 @@ def test_a_profile_of_a_shear_flow():
     np.testing.assert_array_equal(found.grains, [2, 1, 0])
     np.testing.assert_allclose(found.mass, MASS * found.grains)
     np.testing.assert_allclose(found.velocity[:, 0], [0.05, 0.15, 0])
+    np.testing.assert_array_equal(measures.profile(data, (0, 0, 1), [-np.inf, 0.1, 0.1, np.inf]).grains, [2, 0, 2])
 
 
 def test_mixing_is_zero_of_halves_and_one_of_chance():
