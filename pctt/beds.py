@@ -48,6 +48,8 @@ VECTORS = {
     **dict.fromkeys(("v", "velocity", "linvelvec"), "v"),
     **dict.fromkeys(("w", "omega", "angular_velocity", "angvelvec"), "w"),
 }
+#: The quantities that this module knows.
+KNOWN = {"x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz", "id", *SCALARS.values()}
 #: Types of numbers in VTK files, as numpy has them.
 LEGACY = {
     "float": "f4", "double": "f8", "int": "i4", "unsigned_int": "u4", "long": "i8", "unsigned_long": "u8",
@@ -324,15 +326,19 @@ def _table(data: bytes) -> list[Callable[[], Found]]:
     if named:
         names, first = words, first + 1
     else:
-        heads = [formats[-1].split("_")] if formats else [*filter(_places, map(_heading, lines[:first]))]
+        told = (_heading(comment, len(words)) for comment in lines[:first])
+        heads = [formats[-1].split("_")] if formats else [*filter(_places, told)]
         names = heads[-1] if heads else ["x", "y", "z", "r", "clump"][: min(max(len(words), 4), 5)]
     return [lambda: _rows(lines, first, None, names, range(20) if "attrs" in names else (0,), cut)]
 
 
-def _heading(comment: str) -> list[str]:
-    """The words of a comment, without units in brackets and what announces them, such as "columns:"."""
+def _heading(comment: str, count: int) -> list[str]:
+    """The words of a comment, without units in brackets and what announces them, such as "columns:"; of a sentence
+    those that name quantities, if that makes ``count``."""
     plain = re.sub(r"^[#\s]*(\w+:\s)?|[\[(].*?[\])]", "", comment.rstrip())
-    return [word.strip() for word in plain.split(next((mark for mark in ";,\t" if mark in plain), None))]
+    words = [word.strip() for word in plain.split(next((mark for mark in ";,\t" if mark in plain), None))]
+    known = [word for word in words if _name(word) in KNOWN]
+    return known if len(known) == count else words
 
 
 def _places(names: list[str]) -> bool:

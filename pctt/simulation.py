@@ -113,6 +113,7 @@ class Simulation:
         scene = state.built(self.experiment, comm)
         self.dt_reason = reason(scene) if self.settings.dt is None else ""
         self.settings = self.settings.fitted(scene, compared)
+        idle = changes.get("overlap") if restart not in ("", "settled") else None
         if restart == "settled":
             restart = state.settled_state(self.experiment, self.settings, scene, comm, say)
         self._origin = state.origin(self.experiment, scene, self.settings.dt)
@@ -123,6 +124,8 @@ class Simulation:
         else:
             self.world = state.world_at_start(self.experiment, self.settings, scene, comm, program)
             self.memory = ImpulseMemory(comm, self.world.pairs.parts, self.world.pairs.columns)
+        if idle is not None:
+            warn(comm, f"overlap={idle!r} has no effect, as the simulation goes on from a checkpoint")
         falls = "" if restart else comm.bcast(fall_remark(scene, self.settings.dt))
         if large := step_remark(self.world, self.settings.dt) or falls:
             warn(comm, large)

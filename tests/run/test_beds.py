@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import warnings
 import zlib
 from pathlib import Path
 
@@ -88,6 +89,8 @@ def test_a_frame_of_a_dump_is_chosen(tmp_path):
     "# a packing\n# x y z diameter\n{0} {1} {2} {4}\n",
     "# id x [mm] y [mm] z [mm] radius (mm)\n1 {0} {1} {2} {3}\n",
     "#columns: radius, x, y, z\n{3},{0},{1},{2}\n",
+    "# spheres with x y z radius\n{0} {1} {2} {3}\n",
+    "# diameter and place x y z of spheres\n{4} {0} {1} {2}\n",
 ])  # fmt: skip
 def test_tables_of_yade_paraview_and_others(tmp_path, text):
     found = read_spheres(written(tmp_path, text.format(3.0, -4.0, 5.5, 0.25, 0.5)), density=1200.0, length=1e-3)
@@ -180,6 +183,7 @@ DUMP = "ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n1\nITEM: ATOMS {0} radius dens
     ("x,y,z,r\n1,2,3,4\n1,2", {"density": 1}, r"line 3: 2 values where 4 are needed .*truncated"),
     ("x,y,z,r\n1,2,3,4\n1,2\n", {"density": 1}, r"line 3: 2 values where 4 are needed \(x y z r\)$"),
     ("x,y,z,r\n1,2,3,4\n1,2,3,4,5", {"density": 1}, r"line 3: 5 values where 4 are needed \(x y z r\)$"),
+    ("# spheres at x y z\n1 2 3 4\n", {"density": 1}, r"line 2: 4 values where 5 are needed \(spheres at x y z\)$"),
     ("x,y,z,r\n1,2,3,4\n", {"density": 1, "length": 0}, "length must be positive, got 0"),
     ("x,y,z,r\n1,2,3,4\n", {"density": 1, "length": -1}, "length must be positive, got -1"),
     ("x,y,z,r\n1,2,3,4\n", {"density": 1, "type": 2}, r"type 2: has no type; its columns are x, y, z, radius"),
@@ -255,6 +259,18 @@ def test_spheres_without_room_are_told():
     scene.add_body("sides", [Plane(s * np.eye(3)[k], -s * 0.1 * np.eye(3)[k]) for k in (0, 1) for s in (-1, 1)])
     with pytest.raises(OptionError, match="overlap relax: there is no room to push bodies apart"):
         pctt.Simulation(scene, overlap="relax")
+
+
+def test_an_overlap_has_no_effect_on_a_checkpoint_and_that_is_told(tmp_path):
+    """It is not refused: the program that made the checkpoint goes on."""
+    given = {"overlap": "relax", "dt": 1e-3}
+    pctt.Simulation(soft_bed(), **given).save(tmp_path / "bed.h5")
+    with pytest.warns(UserWarning, match="overlap='relax' has no effect, as the simulation goes on from a checkpoint"):
+        loaded = pctt.Simulation.load(tmp_path / "bed.h5", soft_bed(), **given)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        loaded.copy()
+        loaded.reset()
 
 
 @pytest.mark.parallel(2)
