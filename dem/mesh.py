@@ -6,11 +6,9 @@ outwards bounds a solid, which has volume, centre and inertia.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +18,7 @@ from scipy.spatial import ConvexHull, QhullError
 from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.checks import between, check_fields, finite, not_negative, positive, rows, unit_quaternion, vector
 from dem.compiled import loop
-from dem.geometry import stl
+from dem.geometry import obj, stl
 from dem.quaternion import cross, length
 
 
@@ -303,7 +301,7 @@ class Mesh:
         center: Sequence[float] = (0.0, 0.0, 0.0),
         quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
     ) -> Mesh:
-        """From an STL file, or an OBJ or another one that trimesh reads; `scale` is the unit of its numbers in metres
+        """From an STL or OBJ file, or another one that trimesh reads; `scale` is the unit of its numbers in metres
         (1e-3: millimetres). Corners in the same place become one vertex.
 
         ValueError, which names the file, if it cannot be read, has no triangle or needs trimesh, which is not there.
@@ -312,13 +310,15 @@ class Mesh:
         if not Path(file).is_file():
             raise ValueError(f"{file}: no such file")
         try:
-            if Path(file).suffix.lower() == ".stl":
+            kind = Path(file).suffix[1:].lower()
+            if kind == "stl":
                 corners = stl.corners(Path(file).read_bytes())
                 vertices, triangles = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+            elif kind == "obj":
+                vertices, triangles = obj.triangles(Path(file).read_bytes())
             else:
                 load = _trimesh(f"{file}: such meshes are read").load
-                bare = _without_looks(Path(file).read_bytes()) if Path(file).suffix.lower() == ".obj" else str(file)
-                loaded = load(bare, file_type=Path(file).suffix[1:].lower(), force="mesh", process=False)
+                loaded = load(str(file), file_type=kind, force="mesh", process=False)
                 vertices, triangles = np.array(loaded.vertices, dtype=float), np.array(loaded.faces, dtype=np.int64)
             vertices, triangles = _merged(vertices, triangles)
         except NoTrimeshError:
@@ -368,12 +368,6 @@ class Mesh:
         """Write the triangles, in their own frame and in metres, as an STL or OBJ file, by the end of its name."""
         trimesh = _trimesh(f"{file}: meshes are written")
         trimesh.Trimesh(self.vertices, self.triangles, process=False).export(str(file))
-
-
-def _without_looks(data: bytes) -> BytesIO:
-    """An OBJ file with nothing but its corners and faces: texture, normals and materials need other packages."""
-    lines = [line.strip() for line in data.replace(b"\\\n", b" ").splitlines()]
-    return BytesIO(b"\n".join(re.sub(rb"/\S*", b"", line) for line in lines if line[:2] in (b"v ", b"f ")))
 
 
 def _merged(vertices: Floats, triangles: Ints) -> tuple[Floats, Ints]:

@@ -338,6 +338,52 @@ def test_damaged_stl_files_are_refused_with_the_place(tmp_path, data, words):
         Mesh.read(tmp_path / "a.stl")
 
 
+TETRA = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+LATER = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -1 -2\nv 0 0 1\nf 1 2 4\nf -4 -1 3\nf 2 3 4\n"  # counted back from the line
+
+
+@pytest.mark.parametrize("text", [
+    TETRA.replace(" ", "\t"), "\ufeff" + TETRA, TETRA.replace("\n", "\r\n"), TETRA.replace("\n", " # of a tool\n"),
+    TETRA.replace("f 1 ", "f 1 \\\n "), LATER, LATER.replace("f", "usemtl grey\nvn 0 0 1\nf"),
+], ids=range(7))  # fmt: skip
+def test_obj_files_of_many_kinds_hold_the_same_solid(tmp_path, text):
+    (tmp_path / "a.obj").write_bytes(text.encode())
+    mesh = Mesh.read(tmp_path / "a.obj", 1e-3)
+    corner = mesh.surface.corner + mesh.surface.middle
+    assert len(corner) == 4
+    np.testing.assert_allclose(np.linalg.det(corner).sum() / 6, 1e-9 / 6)
+
+
+@pytest.mark.parametrize("first", range(6))
+def test_a_face_that_bends_inwards_is_cut_within_itself(tmp_path, first):
+    """A prism of an L, whatever corner its faces begin with."""
+    ell = np.roll([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], -first, axis=0)
+    lines = [f"v {x} {y} {z}" for z in (0, 1) for x, y in ell] + ["f 6 5 4 3 2 1", "f 7 8 9 10 11 12"]
+    lines += [f"f {k + 1} {(k + 1) % 6 + 1} {(k + 1) % 6 + 7} {k + 7}" for k in range(6)]
+    (tmp_path / "ell.obj").write_text("\n".join(lines))
+    corner = Mesh.read(tmp_path / "ell.obj").surface.corner
+    twice = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    np.testing.assert_allclose(0.5 * np.linalg.norm(twice, axis=1).sum(), 2 * 3 + 8)
+    np.testing.assert_allclose(np.linalg.det(corner).sum() / 6, 3.0)
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    (TETRA.replace("f 1 3 2", "f 0 3 2"), "line 5: 'f 0 3 2': allowed are three or more corners, from 1 on"),
+    (TETRA.replace("f 1 3 2", "f 1 3"), "line 5: 'f 1 3': allowed are three or more corners"),
+    (TETRA.replace("f 1 3 2", "f -5 3 2"), "line 5: 'f -5 3 2': allowed are three or more corners"),
+    (TETRA.replace("f 1 3 2", "f 1 9 2"), "line 5: corner 9, where there are 4: the file is damaged or truncated"),
+    (TETRA.replace("v 1 0 0", "v 1 0"), "line 2: 'v 1 0': allowed are three finite numbers"),
+    (TETRA.replace("v 1 0 0", "v 1 nan 0"), "line 2: 'v 1 nan 0': allowed are three finite numbers"),
+    ("".join(f"v {x} {y} 0\n" for x, y in ((0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)))
+     + "f 1 2 3 4 5 6 7 8\n", "line 9: a face of 8 corners of which none sees all others; allowed are triangles"),
+    ("v 0 0 0\n", "has no triangle"),
+], ids=range(8))  # fmt: skip
+def test_damaged_obj_files_are_refused_with_the_place(tmp_path, text, words):
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(ValueError, match=f"a.obj: .*{words}"):
+        Mesh.read(tmp_path / "a.obj")
+
+
 def test_a_closed_solid_with_texture_has_a_mass(tmp_path):
     """Its corners have other texture coordinates in each face, so that a reader makes three vertices of one place."""
     pytest.importorskip("trimesh")
@@ -353,8 +399,8 @@ def test_a_closed_solid_with_texture_has_a_mass(tmp_path):
 def test_without_trimesh_a_mesh_has_contacts_but_no_mass_and_no_file(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     assert len(on(block(), [0, 0, 0.39], 0.1).pair) == 1
-    (tmp_path / "block.obj").write_text("v 0 0 0\n")
-    for call in (lambda: Mesh.read(tmp_path / "block.obj"), lambda: mass_properties([block()], 1.0)):
+    (tmp_path / "block.ply").write_text("ply\n")
+    for call in (lambda: Mesh.read(tmp_path / "block.ply"), lambda: mass_properties([block()], 1.0)):
         with pytest.raises(ValueError, match="by trimesh, which is not there: pip install"):
             call()
 
