@@ -29,14 +29,15 @@ from pctt.folder import Folder
 def sample(folder: Folder, step: int) -> Sample:
     """Return all grains and contacts of a recorded step. FileError if there is no such step, or if its file is damaged.
 
-    The centres at the start of the step are those of the record less dt times the velocities; that is exact but for
-    bodies with a prescribed motion that turns. A cell that deforms is taken back with them."""
+    Older records have no centres at the start of the step: those of the end, less dt times the velocities, stand for
+    them, without what impacts and turning motions have moved."""
     folder.require_frames()
     frame = folder.frame(step)
     table, grains = frame.table, slice(frame.table.grains)
     contacts = frame.contacts
     stretch = 1.0 + contacts.dt * frame.rate
-    center = ((frame.position - contacts.dt * frame.velocity[:, :3]) / stretch)[contacts.bodies]
+    start = (frame.position - contacts.dt * frame.velocity[:, :3]) / stretch if frame.start is None else frame.start
+    center = start[contacts.bodies]
     if contacts.moved is not None:
         center[:, 1] += contacts.moved
     row, side = np.nonzero(contacts.bodies < table.grains)  # points and grains were put into the cell each by itself

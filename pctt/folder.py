@@ -44,9 +44,9 @@ RUN_FILES = ("settings.json", "steps.jsonl", "checkpoint.h5", *DERIVED)
 FILES = (*RUN_FILES, "frames", HARD)
 
 CONTENTS = (
-    "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, by body id; "
-    "attributes of a periodic cell: lattice m, the ways to the next images along each axis, drift m/s, their "
-    "velocities, and rate 1/s, with which the periods grew; "
+    "steps/STEP: position m, quaternion (w, x, y, z), velocity m/s and rad/s, start m, the position before the step, "
+    "by body id; attributes of a periodic cell: lattice m, the ways to the next images along each axis, drift m/s, "
+    "their velocities, and rate 1/s, with which the periods grew; "
     "record: attributes as in records.csv; "
     "contact: bodies a and b, point m as seen from a, moved m from b to where it is as seen from a, "
     "frame rows (normal from a to b, t1, t2), gap m, "
@@ -174,6 +174,7 @@ class Frame:
     lattice: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     drift: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     rate: np.ndarray = field(default_factory=lambda: np.zeros(3))  #: (3,) with which periods grew in the step [1/s]
+    start: np.ndarray | None = None  #: (n, 3) positions before the step, maybe in another cell; None in older files [m]
 
     def __repr__(self) -> str:
         bodies, contacts = len(self.position), len(self.contacts)
@@ -288,8 +289,9 @@ class Folder:
             same_rows(file, (f"contact/{name}" for name in (*names, "moment", "moved") if name in contact))
             rows = [contact[name][()] for name in names]
             moment, moved = (contact[name][()] if name in contact else None for name in ("moment", "moved"))
-            same_rows(file, (*PLACES, *(TABLE if "id" in file else ())), None if "id" in file else len(self.shape))
-            places = {name: file[name][()] for name in PLACES}
+            columns = [*PLACES, *(["start"] if "start" in file else [])]
+            same_rows(file, (*columns, *(TABLE if "id" in file else ())), None if "id" in file else len(self.shape))
+            places = {name: file[name][()] for name in columns}
             if "id" in file:  # of a scene with sources or outlets
                 own = {name: file[name][()] for name in TABLE}
                 count = len(own["id"]) - len(self.large)

@@ -204,9 +204,10 @@ class Writer:
                 if world.forms:
                     shared["forms"] = np.bytes_(json.dumps(described_forms(world)))
                 write_rows(table, self.comm, rows, shared, {})
-        near = contacts.near.bodies
+        near, count = contacts.near.bodies, contacts.near.grains
+        start = near.position[:count], near.position[count + contacts.near.ghosts :]
         rows = {
-            **_by_id(world, (*PLACES, *(TABLE if world.passages else ()))),
+            **_by_id(world, (*PLACES, *(TABLE if world.passages else ())), start=start),
             "contact/key": contacts.key,
             "contact/body": np.stack([near.id[contacts.a], near.id[contacts.b]], axis=1),
             "contact/point": step.point,
@@ -328,12 +329,14 @@ def described_forms(world: World) -> list[dict[str, Any]]:
     return [{"kind": form.BASE + n, **form.described()} for n, form in enumerate(world.forms)]
 
 
-def _by_id(world: World, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Columns of the table of all bodies, in the order of their ids, spread over the ranks; collective."""
+def _by_id(world: World, names: Sequence[str], **more: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
+    """Columns of the table of all bodies, in the order of their ids, spread over the ranks, and `more` columns by name,
+    of grains and large bodies; collective."""
     grains, comm = world.cell.inside(world.grains), world.comm
     columns = {"id": grains.id, **{name: getattr(grains, name) for name in names}}
+    columns |= {name: own for name, (own, _) in more.items()}
     starts = np.arange(comm.size + 1) * world.ids // comm.size
     rows = exchange(comm, columns, np.searchsorted(starts, grains.id, side="right") - 1)
     order, last = np.argsort(rows["id"]), comm.rank == comm.size - 1
-    large = {name: getattr(world.large, name) for name in names}
-    return {name: np.concatenate([rows[name][order], large[name] if last else large[name][:0]]) for name in names}
+    large = {name: getattr(world.large, name) for name in names} | {name: of for name, (_, of) in more.items()}
+    return {name: np.concatenate([rows[name][order], of if last else of[:0]]) for name, of in large.items()}

@@ -11,8 +11,9 @@ import pctt
 from dem import measures
 from dem.measures import Block
 from dem.mesh import Mesh
+from dem.motion import Rotation
 from dem.scene import Scene
-from dem.shapes import Plane
+from dem.shapes import Box, Plane
 from pctt import analysis
 from pctt.folder import Folder
 
@@ -67,6 +68,27 @@ def test_centres_of_spheres_that_slide_on_each_other_are_alike(tmp_path):
     assert one.force[0, 2] > 0.0
     np.testing.assert_allclose(other.center, one.center, atol=1e-12)
     np.testing.assert_allclose(one.center[0, 1] - one.point[0], 0.1 * one.normal[0], atol=1e-6)
+
+
+@pytest.mark.parallel(1, 2)
+def test_centres_before_impacts_and_turns_are_alike(tmp_path):
+    """Spheres bounce off each other and off a bar that turns: velocities at the end of the step are not those in it."""
+    scene = Scene(0.5, gravity=(0, 0, 0), restitution=0.8)
+    scene.add_spheres([[0.201 * k, 0, 0] for k in range(4)], 0.1, 1000.0, velocity=[[2.0, 0, 0], *[[-1.0, 0, 0]] * 3])
+    scene.add_body("bar", [Box((0.1, 0.05, 0.5))], Rotation((0, 1.0, 0)), position=(0.302, 0.152, 0))
+    with pctt.Simulation(scene, dt=0.002) as sim:
+        sim.write(tmp_path / "run")
+        for _ in range(3):
+            sim.step()
+            found = sim.comm.gather((sim.sample.bodies, sim.sample.point, sim.sample.center))
+            if sim.comm.rank == 0:
+                bodies, point, center = (np.concatenate(columns) for columns in zip(*found))
+                other = analysis.sample(Folder(tmp_path / "run"), sim.steps)
+                both = (bodies, point), (other.bodies, other.point)
+                one, two = (np.lexsort((*place.T.round(9), *pair.T)) for pair, place in both)
+                np.testing.assert_array_equal(other.bodies[two], bodies[one])
+                np.testing.assert_allclose(other.center[two], center[one], atol=1e-12)
+                assert len(point)
 
 
 def test_the_triangles_bear_the_weight_of_the_spheres(results):

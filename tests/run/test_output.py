@@ -114,6 +114,7 @@ def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled,
             "position": (29, 3),
             "quaternion": (29, 4),
             "velocity": (29, 6),
+            "start": (29, 3),
             "contact/key": (nc,),
             "contact/body": (nc, 2),
             "contact/point": (nc, 3),
@@ -134,6 +135,7 @@ def test_the_state_has_bodies_and_contacts_of_each_step(ranks, program, settled,
         if before is not None:  # gaps are those of the start of the step, between the bodies named
             both = contact["body"][:, 1] < 27
             a, b = contact["body"][both].T
+            np.testing.assert_array_equal(data["start"][:27], before["position"][:27])
             distance = np.linalg.norm(before["position"][b] - before["position"][a], axis=1)
             np.testing.assert_allclose(contact["gap"][both], distance - 2 * radius, atol=1e-13)
         before = data
