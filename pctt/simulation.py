@@ -29,6 +29,7 @@ from dem import measures
 from dem import record as recording
 from dem.arrays import Floats, frozen
 from dem.bodies import Bodies
+from dem.exchange import on_any
 from dem.experiment import Experiment, SceneExperiment
 from dem.measures import Sample
 from dem.mesh import Mesh
@@ -110,6 +111,7 @@ class Simulation:
             comm, "settings", lambda: made(Settings, given).completed_for(self.experiment, compared), own=(OptionError,)
         )
         refuse_unlike(self.settings, comm)
+        restart = restart if isinstance(restart, state.RunState) else comm.bcast(restart)
         scene = state.built(self.experiment, comm)
         self.dt_reason = reason(scene) if self.settings.dt is None else ""
         self.settings = self.settings.fitted(scene, compared)
@@ -262,12 +264,13 @@ class Simulation:
         progress: bool = False,
     ) -> None:
         """Make steps until the time ``until`` [s], or so many ``steps``, or until ``stop(self)`` is true after one,
-        whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`.
-        ``progress``: say where it is, and how long it goes on."""
+        whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`. The
+        first rank's values count. ``progress``: say where it is, and how long it goes on."""
         if bare:
             says = ", ".join(map(repr, bare))
             raise OptionError(f"run({says}): steps or seconds? allowed is run(steps={says}), or run(until={says}) [s]")
-        if until is steps is stop is None:
+        until, steps, every, endless = self.comm.bcast((until, steps, every, until is steps is stop is None))
+        if endless:
             raise OptionError("run: without an end; allowed are until, steps and stop")
         refuse_bad(Run(steps=steps or 0))
         if not isinstance(every, (int, np.integer)) or every < 1:
@@ -276,6 +279,7 @@ class Simulation:
         if until is not None:
             left = min(left, self._steps_until(float(until)))
         first, end, ends = self.steps, self.steps + left, False
+        (watched,) = on_any(self.comm, call is not None or stop is not None)
         progress_report = report.Progress(self.comm, quiet=not progress)
         progress_report.passed(first, self.time, end)
 
@@ -288,7 +292,7 @@ class Simulation:
             self.step()
             if self.comm.size == 1:
                 ends = tell()
-            elif call or stop:  # an error of one rank is one of all, and the first rank decides
+            elif watched:  # an error of one rank is one of all, and the first rank decides
                 ends = self.comm.bcast(together(self.comm, "call or stop of run", tell))
             progress_report.passed(self.steps, self.time, self.steps if ends else end)
         self.complete()
@@ -483,11 +487,13 @@ class Simulation:
         steps (0: none), a checkpoint every so many, or in place of that after so many minutes, and the first ``hard``
         cone problems that the solver leaves; to the folder ``problems`` those of all steps.
 
-        ``overwrite`` replaces another run there once a step is made. A simulation loaded from the folder's own
-        checkpoint goes on with its files. FileError if another run has the folder.
+        The first rank's values count. ``overwrite`` replaces another run there once a step is made. A simulation loaded
+        from the folder's own checkpoint goes on with its files. FileError if another run has the folder.
         """
         if self.output is not None:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
+        given = folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems
+        folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems = self.comm.bcast(given)
         run = Run(output_every=every, checkpoint_every=checkpoint_every, checkpoint_minutes=checkpoint_minutes)
         try:
             refuse_bad(run)

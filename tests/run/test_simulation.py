@@ -474,6 +474,22 @@ def test_an_error_of_one_rank_is_one_of_all():
     assert sim.body("stirrer").motion.speed == 0.0
 
 
+@pytest.mark.parallel(2)
+def test_files_and_ends_that_differ_between_ranks_are_those_of_the_first(tmp_path):
+    """As folders of tempfile do, and ends by a clock. A call may be that of one rank alone."""
+    sim, told = pctt.Simulation(Stirred(), solver="apgd"), []
+    sim.write(tmp_path / f"of {WORLD.rank}", every=1 + WORLD.rank)
+    sim.run(steps=2 + WORLD.rank, call=(lambda sim: told.append(sim.steps)) if WORLD.rank else None)
+    sim.run(until=sim.time + (1.0 + WORLD.rank) * sim.settings.dt, every=1 + WORLD.rank)
+    sim.close()
+    assert told == [1, 2] * WORLD.rank
+    assert sim.steps == 3
+    assert [path.name for path in tmp_path.glob("of *")] == ["of 0"]
+    assert Folder(tmp_path / "of 0").steps == [1, 2, 3]
+    kept = "" if WORLD.rank else tmp_path / "of 0" / "checkpoint.h5"
+    assert pctt.Simulation(Stirred(), solver="apgd", restart=kept).steps == 3
+
+
 # -- notebooks ----------------------------------------------------------------------------------------------
 
 
