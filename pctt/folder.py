@@ -124,7 +124,7 @@ class Contacts(Tabular):
     """The contacts of a step between bodies a and b, and the impulses that acted in the step."""
 
     bodies: np.ndarray  #: (nc, 2) numbers of a and b in the order of the scene: grains, then large bodies
-    point: np.ndarray  #: (nc, 3) in the middle between the surfaces, as seen from body a at the start of the step [m]
+    point: np.ndarray  #: (nc, 3) on a, in an overlap between both, as seen from a at the start of the step [m]
     frame: np.ndarray  #: (nc, 3, 3) with rows normal (from a to b), t1, t2
     gap: np.ndarray  #: (nc,) at the start of the step, negative if the bodies overlap [m]
     impulse: np.ndarray  #: (nc, 3) on b, in the contact frame [N s]
