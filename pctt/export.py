@@ -1,6 +1,6 @@
 """``python -m pctt.export DIR``: the recorded steps of a run as time series for ParaView, or as one HDF5 file.
 
-The program writes DIR/paraview/bodies.pvd, contacts.pvd and large.pvd, and polyhedra.pvd if there are such grains. Each
+The program writes DIR/paraview/bodies.pvd and contacts.pvd, and large.pvd and polyhedra.pvd if there are such. Each
 is a list of .vtp files, one per step. Any number of ranks share the steps. Every ParaView and VTK of the last fifteen
 years reads these formats. With ``-format vtkhdf`` the first rank writes files of these names and the ending .vtkhdf
 instead, for ParaView 5.12 or newer. Each of these files has all steps.
@@ -26,7 +26,7 @@ from pctt.folder import RUN_FILES, Folder, Frame
 from pctt.look.program import chosen, described_steps, made_folder, parser, run
 from pctt.options import OptionError
 
-SERIES = ("bodies", "contacts", "large")
+SERIES = ("bodies", "contacts", "large", "polyhedra")
 
 
 def arguments() -> argparse.Namespace:
@@ -56,7 +56,9 @@ def main(comm: MPI.Comm) -> None:
     from pctt.look.surfaces import Scene  # imported here, because it needs vtk and -help does not
 
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # the writers' results are checked
-    names = [*SERIES, *(["polyhedra"] if any("triangles" in form for form in folder.forms) else [])]
+    absent = set() if folder.large else {"large"}
+    absent |= set() if any("triangles" in form for form in folder.forms) else {"polyhedra"}
+    names = [name for name in SERIES if name not in absent]
     scene = Scene(folder, [folder.frame(step) for step in (steps[0], steps[-1])])
     form = given.format or "vtp"
     if form == "vtp":
@@ -104,7 +106,7 @@ def write_single(path: Path, folder: Folder, steps: list[int]) -> None:
 
 
 def series(name: str, scene: Any, frame: Frame) -> Any:
-    """One step of the series ``name``, one of SERIES or polyhedra, as vtkPolyData; ``scene`` is a
+    """One step of the series ``name``, one of SERIES, as vtkPolyData; ``scene`` is a
     `pctt.look.surfaces.Scene`."""
     return {"bodies": bodies, "contacts": contacts, "large": large, "polyhedra": facets}[name](scene, frame)
 

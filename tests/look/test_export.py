@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from dem.scene import Scene
 from pctt import export
 from pctt.disk import FileError
 from pctt.folder import Folder
 from pctt.look import program
+from pctt.simulation import Simulation
 
 pytest.importorskip("pctt.look.surfaces", reason="vtk 9.4 is not installed (extra `pictures`)")
 
@@ -94,6 +96,20 @@ def test_all_steps_in_one_file(show, folder, tmp_path):
                 assert data.GetNumberOfLines() == len(frame.contacts.gap)
             else:
                 assert data.GetNumberOfPolys() > 0
+
+
+@pytest.mark.parametrize("kind", ["vtp", "vtkhdf"])
+def test_a_run_without_large_bodies_has_no_file_of_them(show, tmp_path, kind):
+    """A series that is empty in all steps made VTK's writer lose it, which was an error."""
+    pytest.importorskip("vtkmodules.vtkIOHDF")
+    scene = Scene(0.3, gravity=(0, 0, 0), period=(0.6, 0.6, 0.6), shear_rate=1.0)
+    scene.add_spheres(0.2 * np.indices((3, 3, 3)).reshape(3, -1).T, 0.1, 1000.0)
+    with Simulation(scene, dt=0.005, comm=MPI.COMM_SELF) as sim:
+        sim.write(tmp_path / "run")
+        sim.run(steps=2)
+    show("export", "-output", tmp_path / "series", "-format", kind, folder=tmp_path / "run")
+    end = {"vtp": ".pvd", "vtkhdf": ".vtkhdf"}[kind]
+    assert {path.stem for path in (tmp_path / "series").glob(f"*{end}")} == {"bodies", "contacts"}
 
 
 def test_glyphs_have_the_extents_of_the_grains_and_force_chains_join_centres(show, tmp_path):
