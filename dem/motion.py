@@ -286,9 +286,13 @@ class Path:
     @classmethod
     def read(cls, file: str | FilePath) -> Path:
         """From a text file with time [s] and x, y, z [m] in each line, between them commas or blanks; # begins a
-        remark. ValueError, which names the file, for any other line."""
+        remark. ValueError, which names the file, if it cannot be read, and for any other line."""
+        try:
+            text = FilePath(file).read_text("utf-8-sig", "replace")
+        except OSError as error:
+            raise ValueError(f"{file}: cannot be read ({error.strerror or error})") from None
         found = []
-        for number, line in enumerate(FilePath(file).read_text().splitlines(), 1):
+        for number, line in enumerate(text.splitlines(), 1):
             words = line.partition("#")[0].replace(",", " ").split()
             if not words:
                 continue

@@ -143,6 +143,10 @@ def test_a_path_from_a_file(tmp_path):
     file = tmp_path / "path.csv"
     file.write_text("# t, x, y, z\n0, 0, 0, 0\n\n1.5  0 1 0  # up\n")
     assert Path.read(file) == Path((0, 1.5), ((0, 0, 0), (0, 1, 0)))
+    file.write_bytes("\ufeff0,0,0,0\r\n1.5,0,1,0\r\n".encode())  # as spreadsheets write it
+    assert Path.read(file) == Path((0, 1.5), ((0, 0, 0), (0, 1, 0)))
+    with pytest.raises(ValueError, match=r"none.csv: cannot be read \(No such file or directory\)"):
+        Path.read(tmp_path / "none.csv")
     for text, words in (
         ("0 0 0 0\n1 2 3\n", "line 2: not a time and three coordinates: 1 2 3"),
         ("0 0 0 x\n", "line 1: not a time"),
