@@ -56,6 +56,7 @@ def _direction(axis: ArrayLike) -> Floats:
 
 def mean_position(sample: Sample, mask: Bools) -> Floats:
     """Return the mean (3,) of the centres of the grains of a mask (n,) [m]; NaN if there are none."""
+    mask = sample.marked(mask)
     total = summed(sample, np.append(sample.position[mask].sum(axis=0), mask.sum()))
     return total[:3] / (total[3] or np.nan)
 
@@ -73,7 +74,7 @@ def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> 
     With p the fraction of them among all, and s^2 the variance of the fractions in the cells, each with the weight of
     its grains: Lacey's index is (p (1 - p) - s^2) / (p (1 - p) - p (1 - p) / m) for cells of m grains on average that
     are not empty. NaN if there is one kind alone, or one grain per cell."""
-    shape, (low, high) = counts("cells", cells), region.bounds
+    shape, (low, high), mask = counts("cells", cells), region.bounds, sample.marked(mask)
     rows, position, _ = sample.grains_in(low, high)
     inside = region.contains(position)
     rows, place = rows[inside], ((position[inside] - low) / ((high - low) / shape)).astype(np.int64)

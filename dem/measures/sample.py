@@ -48,6 +48,14 @@ class Sample:
             raise ValueError(f"material {material!r}: allowed is one of {', '.join(self.materials)}")
         return self.material == self.materials.index(material)
 
+    def marked(self, mask: Any) -> Bools:
+        """A mask of the grains as an array (n,); ValueError for anything else, as numbers would be taken for rows."""
+        array = np.asarray(mask)
+        if array.shape != self.mass.shape or (array.dtype != bool and len(array)):
+            what = f"{array.shape} of {array.dtype}"
+            raise ValueError(f"mask: allowed is True or False for each of the {len(self.mass)} grains here, got {what}")
+        return array.astype(bool)
+
     def grains_in(self, low: Floats, high: Floats, reach: float = 0.0) -> tuple[Ints, Floats, Floats]:
         """Rows (m,), positions (m, 3) and linear velocities (m, 3) of this rank's grains and their images with centres
         in the box from `low` to `high` (3,) or within `reach` of it [m]."""

@@ -23,7 +23,7 @@ def stress(sample: Sample, region: Region | Bools, volume: float | None = None) 
         row, point, branch = branches(sample, end, *region.bounds)
         part, force = region.part(point, point + branch), end.force.take(row, axis=0)
     else:
-        part, force, branch = _everywhere(sample, region)[end.grain], end.force, end.center - end.point
+        part, force, branch = _everywhere(sample, sample.marked(region))[end.grain], end.force, end.center - end.point
     return summed(sample, (part[:, None] * force).T @ branch) / _volume(region, volume)
 
 
@@ -35,7 +35,8 @@ def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None 
         inside = region.contains(place)
         mass, velocity = sample.mass[row[inside]], velocity[inside]
     else:
-        mass, velocity = sample.mass[region], sample.velocity[region, :3]
+        rows = sample.marked(region)
+        mass, velocity = sample.mass[rows], sample.velocity[rows, :3]
     total = summed(sample, np.append(mass @ velocity, mass.sum()))
     beyond = velocity - total[:3] / (total[3] or 1.0)
     return summed(sample, (beyond.T * mass) @ beyond) / _volume(region, volume)

@@ -175,6 +175,20 @@ def test_an_axis_of_a_profile_that_is_no_direction_is_refused(axis):
         measures.profile(column(), axis, [0, 1])
 
 
+@pytest.mark.parametrize("mask", [np.ones(4, int), np.arange(4), np.ones(5, bool), np.ones((4, 1), bool), [0.0] * 4])
+def test_a_mask_that_is_none_is_refused(mask):
+    data, words = column(), r"mask: allowed is True or False for each of the 4 grains here, got "
+    for measured in (
+        lambda: measures.stress(data, mask, 1.0),
+        lambda: measures.kinetic_stress(data, mask, 1.0),
+        lambda: measures.mixing(data, mask, WIDE, (2, 2, 2)),
+        lambda: measures.mean_position(data, mask),
+    ):
+        with pytest.raises(ValueError, match=words):
+            measured()
+    assert (measures.stress(data, [True] * 4, 1.0) == measures.stress(data, np.ones(4, bool), 1.0)).all()
+
+
 @pytest.mark.parametrize("edges", [[0.3, 0.2, 0.0], [0.1], [[0, 1], [1, 2]], [0, np.nan]])
 def test_edges_of_a_profile_that_do_not_ascend_are_refused(edges):
     with pytest.raises(ValueError, match=r"edges .*: allowed are two or more numbers, none below the one before"):
