@@ -330,6 +330,8 @@ class Scene:
         The grains have theirs at the centre of mass along the principal axes, see `dem.shapes.clumps`. density
         [kg/m^3] one for all or (n,); velocities (3,) or (n, 3), the linear one is that of the centre of mass.
         """
+        if not isinstance(shape, Clump):
+            raise ValueError(f"shape of clumps: allowed is a Clump, got {type(shape).__name__}")
         form = clumps.form(shape)
         return self._add_form(form, positions, density, 1.0, quaternions, material, velocity, angular_velocity)
 
@@ -678,6 +680,8 @@ class Scene:
         )
 
     def _material(self, name: str) -> int:
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"material {name!r}: allowed is a name, such as 'steel'")
         return self._materials.setdefault(name, len(self._materials))
 
     def _add_grains(
@@ -727,10 +731,10 @@ class Scene:
             Column.checked("angular velocity", angular_velocity, count, 3),
         ]
         given = {column.name: column for column in columns}
-        if not isinstance(material, str) and len(material) != count:
+        one = isinstance(material, str) or not isinstance(material, Iterable)
+        if not one and len(material) != count:
             raise ValueError(f"material must be one name or {count} names, got {len(material)}")
-        one = isinstance(material, str)
-        numbers = self._material(str(material)) if one else np.array([self._material(name) for name in material])
+        numbers = self._material(cast(str, material)) if one else np.array([self._material(name) for name in material])
         self.parts.append(Part(count, kind, numbers, given, solid))
         self._survey = None
         ids = range(first, first + count)

@@ -311,6 +311,10 @@ def of_scene(
     if shear_gradient not in ("y", "z"):
         raise ValueError(f"shear_gradient must be 'y' or 'z', got {shear_gradient!r}")
     axis = "xyz".index(shear_gradient)
+    if shear_rate is None and shear_gradient != "y":
+        raise ValueError(f"shear_gradient {shear_gradient!r} needs a shear_rate, or 0")
+    if start > 0.0 and not deforms:
+        raise ValueError(f"strain_start {start:g} needs a strain_rate or a stress")
     if shear_rate is not None and np.isinf(repeats[[0, axis]]).any():
         raise ValueError(f"shear_rate needs periods along x and {shear_gradient}")
     return Cell(repeats, None if shear_rate is None else axis, rate, 0.0, deforms, asked, strain, start)

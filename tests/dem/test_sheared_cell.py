@@ -157,6 +157,10 @@ def test_refused():
         Scene(0.3, period=(0.5, 0.5, None), shear_rate=1.0, shear_gradient="z")
     with pytest.raises(ValueError, match="shear_gradient must be"):
         Scene(0.3, period=(0.5, 0.5, 0.5), shear_rate=1.0, shear_gradient="x")
+    with pytest.raises(ValueError, match="shear_gradient 'z' needs a shear_rate"):
+        Scene(0.3, period=(0.5, 0.5, 0.5), shear_gradient="z")
+    with pytest.raises(ValueError, match="strain_start 1 needs a strain_rate or a stress"):
+        Scene(0.3, period=(0.5, 0.5, 0.5), strain_start=1.0)
     scene = Scene(0.3, period=(0.5, 0.5, None), shear_rate=1.0)
     scene.add_spheres([[0.1, 0.1, 0.1]], radius=0.05, density=1000.0)
     scene.add_body("floor", [Plane(normal=(0, 0, 1))])
