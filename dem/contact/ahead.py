@@ -20,6 +20,10 @@ along each other in the step, the term with dt/2, is foreseen and added (`Contac
 with another one does not creep on it. Bodies of prescribed motion have the arms of the end, as normals: a tool does the
 work that its force does at the speed of its face.
 
+Round bodies on a flat face that impulses move have its normal of the start, too. The normal turns with the face, and
+the place goes along the face as it rolls on them: with the normal of the end, and arms along it, each step would take
+energy from a plank that rocks on a log, to first order.
+
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
 there then goes with the host (`seen_from`, `turn_ahead`).
@@ -61,7 +65,7 @@ class Course(NamedTuple):
 
 
 Moving = tuple[Floats, Floats, Bools, float]  #: a `Course`
-Touching = tuple[Floats, Floats, Floats]  #: a `Touch`
+Touching = tuple[Floats, Floats, Floats, Bools]  #: a `Touch`, and which are of `dem.contact.primitives.on_faces`
 
 
 def hosts_first(one: Ints, two: Ints) -> Bools:
@@ -117,7 +121,7 @@ def turn_ahead(
 
     `arcs` (nc, 4, 3) are as of `dem.contact.convex.arcs_of`; empty without such shapes."""
     (kind, row, size, _), (center, quaternion) = forms, poses
-    (place, velocity, moves, dt), (point, normal, gap) = course, touch
+    (place, velocity, moves, dt), (point, normal, gap, on_face) = course, touch
     moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
     deep, found = np.empty(len(pair), np.int64), 0
     for c in range(len(pair)):
@@ -158,8 +162,12 @@ def turn_ahead(
             inside = after_turn(plus(own, -1.0, arc), u, -h)
         if h == 0.0 or dot(n, n) == 0.0:
             continue
+        rolls = on_face[c] and flat and dot(arc, arc) > 0.0
+        if rolls:
+            n = after_turn(n, w, -h)
+            first_arc = vector_of(arcs[c, 1], 0) if kind[a] >= CONVEX else (core * n[0], core * n[1], core * n[2])
         below = plus(center[b], -1.0, place[B]) if kind[b] == SPHERE else after_turn(plus(their, -1.0, bow), w, -h)
-        if moves[A]:
+        if moves[A] or rolls:
             own = plus(inside, 1.0, first_arc)
             if flat:
                 below = plus(own, 1.0, apart)  # the two arms lead to one place
@@ -167,7 +175,7 @@ def turn_ahead(
             their = plus(below, 1.0, first_bow)
         linear[c] = after - h * dot(n, plus(plus(W, 1.0, cross(w, their)), -1.0, plus(V, 1.0, cross(u, own))))
         half = 0.5 * min(gap[c] if here else linear[c], 0.0)
-        if moves[A] and flat:
+        if (moves[A] or rolls) and flat:
             below = plus(below, linear[c], n)
             their = below if moves[B] else their
         more = plus(_bend(below, w, dt), -1.0, _bend(inside, u, dt))

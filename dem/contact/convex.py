@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dem.arrays import Floats, Ints
+from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, enclosing_radius, half_thickness
 from dem.compiled import inlined, loop
 from dem.contact.ahead import Forms, Moving, Poses, Touching, after_turn, ahead_by, guest_is_second, spun, vector_of
@@ -35,6 +35,9 @@ from dem.shapes.forms import Form
 #: Cosine of the angle to the normal of a face, or sine to an edge, within which these may lie flush.
 FLUSH = 0.9
 EDGE = 0.2
+
+#: A face is flat where a tilt of its direction moves the furthest point by more half thicknesses than FAR.
+TILT, FAR = 1e-4, 0.01
 
 #: Sine of the angle between lines below which they lie side by side.
 PARALLEL = 0.05
@@ -173,6 +176,11 @@ def solids_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> M
         given = body.take(others), Planes(*(column[others] for column in plane)), delta[others]
         parts.append((others, _on_planes(*given, hulls)))
     return joined([found._replace(pair=numbers[found.pair]) for numbers, found in parts])
+
+
+def flat_towards(body: Solids, outward: Floats, hulls: Hulls) -> Bools:
+    """Which of the solids (m,) have a flat face towards a direction (m, 3) of the world."""
+    return _flat(*body.tables(), *_tables(hulls), outward)
 
 
 def _on_planes(body: Solids, plane: Planes, delta: Floats, hulls: Hulls) -> Manifold:
@@ -563,6 +571,22 @@ def _pairs(first, form, second, other_form, vertices, faces, delta, progress, co
 
 
 @loop
+def _flat(body, form, vertices, faces, outward):
+    """Where the furthest point goes far as the direction tilts a little, to all sides."""
+    thick, frame, flat = body[3], np.empty((3, 3)), np.ones(len(outward), np.bool_)
+    for m in range(len(outward)):
+        shape = _shape(body, form, vertices, faces, m)
+        frame[2, 0], frame[2, 1], frame[2, 2] = _inward(shape.turn, vector_of(outward[m], 0))
+        _across(frame)
+        for k in range(2):
+            one, other = plus(frame[2], TILT, frame[k]), plus(frame[2], -TILT, frame[k])
+            there = _support(shape, 0.0, one[0], one[1], one[2])
+            way = plus(there, -1.0, _support(shape, 0.0, other[0], other[1], other[2]))
+            flat[m] = flat[m] and dot(way, frame[k]) * shape.scale > FAR * thick[m]
+    return flat
+
+
+@loop
 def _planes(body, form, vertices, faces, plane, delta, contacts):
     """Fill in the contacts of shapes with half spaces; their number."""
     (center, _, _, thick), (outward, origin), (pair, feature, out) = body, plane, contacts
@@ -599,11 +623,11 @@ def arcs_of(
     supports: tuple[Ints, Floats, Floats, Floats],
 ) -> Floats:  # fmt: skip
     """Of contacts (nc,) as of `dem.contact.ahead.turn_ahead`, vectors (nc, 4, 3) from what turns with the bodies to
-    their surfaces where these have the foreseen normal [m]: of guests at the end of the step and at its start, of hosts
-    at these two. As a surface rolls on, the contact stays where its normal is. Zeros of points that go with the body,
-    and of shapes of other kinds."""
+    their surfaces where these have the foreseen normal, guests on faces that of the start [m]: of guests at the end of
+    the step and at its start, of hosts at these two. As a surface rolls on, the contact stays where its normal is.
+    Zeros of points that go with the body, and of shapes of other kinds."""
     (kind, row, size, _), (center, quaternion) = forms, poses
-    (place, velocity, _, _), (point, normal, gap) = course, touch
+    (place, velocity, _, _), (point, normal, gap, on_face) = course, touch
     what, numbers, radii, _ = supports
     arcs = np.zeros((len(pair), 4, 3))
     for c in range(len(pair)):
@@ -637,7 +661,7 @@ def arcs_of(
             if not _other_rolls(which, numbers[f], x, y, z, p / scale, q / scale, r / scale):
                 continue
             at_end = _other_arc(which, numbers[f], x, y, z)
-            x, y, z = _into(start, ahead)
+            x, y, z = _into(start, after_turn(ahead, w, -h) if on_face[c] and side == 0 else ahead)
             at_start = _other_arc(which, numbers[f], x, y, z)
             if dot(at_end, at_end) == 0.0 or dot(at_start, at_start) == 0.0:
                 continue

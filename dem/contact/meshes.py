@@ -33,6 +33,9 @@ ROUNDING = 1e-6
 #: The same for the side of a capsule on an edge: one that rocks a little on two edges keeps the contacts of both.
 ROCKING = 0.1
 
+#: The same for edges of a face that a round body rolls on.
+TILT = 1e-4
+
 #: Features of a capsule on a surface: those of the surface for each end ball, and for the core between.
 PARTS = 3
 
@@ -133,6 +136,18 @@ def within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, sl
     offset = surface.vertex[vertex[entry]] - point[rim[row]]
     inside[rim[row[dot(offset, away[rim[row]]) > slack * length(offset)]]] = False
     return inside
+
+
+def flat_across(surface: Surface, feature: Ints, away: Floats) -> Bools:
+    """Which features (k,) of contacts are flat across the directions `away` (k, 3): faces, and edges of one there."""
+    feature, faces = feature % surface.features, len(surface.triangle)
+    flat: Bools = feature < faces
+    rim = np.flatnonzero(~flat & (feature < faces + len(surface.edge)))
+    edge, (start, vertex) = feature[rim] - faces, surface.around
+    row, entry = spread(start, edge)
+    offset = surface.vertex[vertex[entry]] - surface.vertex[surface.edge[edge[row], 0]]
+    flat[rim[row[np.abs(dot(offset, away[rim[row]])) <= TILT * length(offset)]]] = True
+    return flat
 
 
 def _one_for_each(row: Ints, triangle: Ints, found: Closest, least: Ints, radius: Floats, surface: Surface) -> Ints:

@@ -9,12 +9,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from dem import quaternion
-from dem.arrays import Floats, Ints
+from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
 from dem.contact.ahead import Course, Forms, Poses, hosts_first, seen_from, turn_ahead
 from dem.contact.clumps import Members, members, more_numbers, spread
-from dem.contact.convex import Solids, Supports, arcs_of, solids, solids_planes, solids_solids, supports_of
-from dem.contact.meshes import PlacedMesh, capsule_mesh, plane_mesh, sphere_mesh
+from dem.contact.convex import (
+    Solids,
+    Supports,
+    arcs_of,
+    flat_towards,
+    solids,
+    solids_planes,
+    solids_solids,
+    supports_of,
+)
+from dem.contact.meshes import PlacedMesh, capsule_mesh, flat_across, plane_mesh, sphere_mesh
 from dem.contact.narrow import (
     Boxes,
     Capsules,
@@ -221,12 +230,14 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
 
 
 def touches_ahead(
-    table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course
+    table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course, grains: int
 ) -> tuple[Manifold, Floats, Floats, Floats]:
-    """The contacts as `turn_ahead` gives them directions of the end of a step, and what this returns of them. A deep
-    gap is no deeper than the pair overlaps at the start, and none is wider than `delta` there."""
+    """The contacts as `turn_ahead` gives them directions of the end of a step, and what this returns of them; the first
+    rows of bodies, so many, are `grains`. A deep gap is no deeper than the pair overlaps at the start, and none is
+    wider than `delta` there."""
     found = touches(table, i, j, delta, course)
-    given, arcs = (*table.tables(), course[:], i, j, found.pair, found.touch[:]), np.zeros((0, 4, 3))
+    touch = (*found.touch, on_faces(table, i[found.pair], j[found.pair], found, course.moves, grains))
+    given, arcs = (*table.tables(), course[:], i, j, found.pair, touch), np.zeros((0, 4, 3))
     if (table.kind >= CONVEX).any():
         arcs = arcs_of(*given, table.supports[:])
     moved, swing, linear, deep = turn_ahead(*given, arcs)
@@ -239,6 +250,26 @@ def touches_ahead(
         found = Manifold(found.pair[~wide], found.feature[~wide], found.touch.take(~wide))
         moved, swing, linear = moved[~wide], swing[~wide], linear[~wide]
     return found, moved, swing, linear
+
+
+def on_faces(table: Primitives, one: Ints, two: Ints, found: Manifold, moves: Bools, grains: int) -> Bools:
+    """Which contacts (nc,) of the rows `one` and `two` (nc,) are of round guests on flat faces of hosts that impulses
+    move, by the rows of bodies `moves`. Not of two grains: in beds energy would grow."""
+    kind, flat = table.kind, np.zeros(len(one), np.bool_)
+    if not (faces := moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)).any():
+        return flat
+    swap = hosts_first(kind[one], kind[two])
+    guest, host = np.where(swap, two, one), np.where(swap, one, two)
+    is_round = (kind[guest] == SPHERE) | (kind[guest] == CAPSULE) | (kind[guest] >= CONVEX)
+    rows = np.flatnonzero(faces[host] & is_round & (table.row[two] >= grains))  # large bodies are the second ones
+    away = found.touch.normal * np.where(swap, 1.0, -1.0)[:, None]
+    flat[rows[kind[host[rows]] == PLANE]] = True
+    for row in table.surfaces:
+        mesh, own = table.mesh(row), rows[host[rows] == row]
+        flat[own] = flat_across(mesh.surface, found.feature[own], away[own] @ mesh.turn)
+    own = rows[(kind[host[rows]] != PLANE) & (kind[host[rows]] != MESH)]
+    flat[own] = flat_towards(table.solid(host[own]), away[own], table.hulls)
+    return flat
 
 
 def _touching(
@@ -310,8 +341,9 @@ def _in_pairs(kind: int) -> int:
     return kind
 
 
-def refuse_untouchable(grains: Sequence[int], large_bodies: Sequence[LargeBody]) -> None:
-    """ValueError for kinds of grains, and shapes of large bodies, that might meet and have no contacts."""
+def refuse_untouchable(grains: Sequence[int], large_bodies: Sequence[LargeBody], meet: Bools) -> None:
+    """ValueError for kinds of grains, and shapes of large bodies, that might meet and have no contacts; `meet` (large,
+    large) tells of which pairs of large bodies, the first before the second, contacts are wanted."""
     of_grains = [(f"grains that are {_NAMES[kind]}", kind) for kind in sorted({_in_pairs(kind) for kind in grains})]
     pairs = list(combinations_with_replacement(of_grains, 2))
     shapes = [[(f"the {type(s).__name__.lower()} of {b.name!r}", _in_pairs(placed(s)[0])) for s in b.shapes]
@@ -319,7 +351,7 @@ def refuse_untouchable(grains: Sequence[int], large_bodies: Sequence[LargeBody])
     pairs += [(grain, part) for parts in shapes for part in parts for grain in of_grains]
     moves = [isinstance(body.motion, Dynamic) for body in large_bodies]
     for one, other in combinations(range(len(shapes)), 2):
-        if moves[one] or moves[other]:
+        if meet[one, other] and (moves[one] or moves[other]):
             pairs += product(shapes[other], shapes[one])
     for (first, kind), (second, host) in pairs:
         if not _can_touch(kind, host):

@@ -170,7 +170,7 @@ def _narrow(
         return touches(table, *pairs), {}
     motions = _motions(world, near, images, free.prescribed)
     course = Course(near.bodies.position, motions, bodies.is_dynamic(near.bodies), free.dt)
-    found, moved, swing, linear = touches_ahead(table, *pairs, course)
+    found, moved, swing, linear = touches_ahead(table, *pairs, course, near.grains + near.ghosts)
     return found, {"moved": moved, "swing": swing, "linear": linear}
 
 

@@ -138,13 +138,15 @@ def _world(scene: Scene, comm: MPI.Comm, grains: Bodies) -> World:
     world = World(comm, tuple(scene.large_bodies), scene.gravity, pairs, scene.materials, grains, scene.large())
     world.named, world.cell = {kind: dict(members) for kind, members in scene.named.items()}, scene.cell
     world.forms = tuple(scene.forms)
-    refuse_untouchable(scene.kinds, scene.large_bodies)
     world.passages = scene.passages.counted(world.named["source"])
     world.initial, world.first_large = scene.count, scene.first_large
     number = {body.name: int(id) for body, id in zip(world.large_bodies, world.large.id)} | {None: -1}
     parts = [part for _, _, members in kinds_of(Tie, world.named) for part in members.values() if not part.touching]
     ids = [sorted(end if isinstance(end, int) else number[end] for end in part.ends) for part in parts]
     world.apart = np.unique(np.array([pair for pair in ids if pair[0] >= 0], float).reshape(-1, 2) @ [1.0, 1.0j])
+    material, key = world.large.material, world.large.id[:, None] + 1j * world.large.id
+    meet = (pairs.touching[material][:, material] > 0.0) & ~np.isin(key, world.apart)
+    refuse_untouchable(scene.kinds, scene.large_bodies, meet)
     for members in world.named.values():
         for name, part in members.items():
             part.refuse(name, world)

@@ -42,6 +42,7 @@ from dem.start.falls import DENSE, area, fall
 from dem.start.pressing import CHAINS, pressing
 from dem.start.time_step import fastest_grain, fastest_tool
 from dem.start.time_step import recommended as recommended_step
+from dem.start.toppling import toppling
 
 OVERLAP = 0.003  #: the greatest overlap that `recommended` allows, as a part of a grain's half thickness
 FALLEN = 0.005  #: the same for a moment, of a grain that has fallen
@@ -70,7 +71,7 @@ def recommended(scene: Scene) -> float:
     A speed v that reaches a row of grains of mass m makes the force k d = v sqrt(k m), a wave along the row. A bed
     gives way to a tool before that: with at most RESISTS times the force of its weight (docs/mechanics.md), or with
     that of the single grain that the tool throws. What has fallen (`dem.start.falls`) is stopped in a step of the
-    time step that the scene needs.
+    time step that the scene needs. What topples and is smooth rolls on over its flat side (`dem.start.toppling`).
     """
     grains, pressed, dt = scene.expected(), pressing(scene), recommended_step(scene)
     half = bodies.least_half_thickness(grains)
@@ -80,7 +81,7 @@ def recommended(scene: Scene) -> float:
         thrown, pushed = (grains.mass * (speed / allowed) ** 2 for speed in speeds)
         needed = [_strongest(_load(scene, pressed) / allowed, thrown, pushed, STOPPED**2), pressed.force / allowed]
         needed += [_stopping(*impact, dt, FALLEN * half) for impact in _impacts(scene, pressed, dt)]
-        stiffness = max(float(values.max()) for values in needed)
+        stiffness = max(toppling(scene).stiffness, *(float(values.max()) for values in needed))
     return float(f"{stiffness:.1e}") if stiffness > 0.0 else np.inf  # the same on processors that round in other ways
 
 
@@ -103,7 +104,7 @@ def expected_overlap(scene: Scene, stiffness: float, dt: float) -> float:
     overlaps = [_strongest(_load(scene, pressed) / stiffness, thrown, pushed, STOPPED)]
     overlaps.append(np.full(len(half), pressed.force / stiffness))
     overlaps += [_stopped(*impact, dt, stiffness) for impact in _impacts(scene, pressed, dt)]
-    return max(float((values / half).max()) for values in overlaps)
+    return max(toppling(scene).overlap(stiffness), *(float((values / half).max()) for values in overlaps))
 
 
 def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:

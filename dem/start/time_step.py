@@ -20,6 +20,7 @@ from dem.scene import LargeBody, Scene
 from dem.shapes import Plane
 from dem.start.falls import fall
 from dem.start.pressing import pressing
+from dem.start.toppling import toppling
 from dem.start.turns import TURN, held_beside, turning_of_grains, turning_of_large
 
 DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/choose.md has the errors of forces
@@ -30,8 +31,9 @@ PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same an
 
 def recommended(scene: Scene) -> float:
     """Return the time step [s] with which forces on tools are within a few per cent of those of smaller steps, grains
-    that fall go no further than FALLS of their half thicknesses, and bodies that are no spheres turn by no more than
-    TURN at time zero, to two digits; 0.01 s for a scene without all that."""
+    that fall go no further than FALLS of their half thicknesses, bodies that are no spheres turn by no more than TURN
+    at time zero, and the contacts of those that topple are foreseen, to two digits; 0.01 s for a scene without all
+    that."""
     return min(needs(scene).values())
 
 
@@ -50,6 +52,8 @@ def needs(scene: Scene) -> dict[str, float]:
     found |= {what: _rounded(dt) for what, dt in scene.cell.needs(scene.expected()).items()}
     if (spin := fastest_turn(scene)) > 0.0:
         found[f"bodies that turn at {spin:.3g} rad/s"] = _rounded(TURN / spin)
+    if (toppled := toppling(scene)).dt < np.inf:
+        found[f"bodies that topple to {toppled.turn.max():.3g} rad/s"] = _rounded(toppled.dt)
     return found | {what: _rounded(step) for what, step in pressed.steps}
 
 

@@ -50,7 +50,7 @@ def turning_of_grains(grains: bodies.Bodies, held: Sequence[int]) -> Floats:
 
 def _is_ball(body: LargeBody) -> bool:
     balls = all(isinstance(shape, Sphere) and not np.any(shape.center) for shape in body.shapes)
-    return balls and bool(np.ptp(body.inertia) <= 1e-9 * body.inertia.max())
+    return balls and bool(body.inertia.min() >= (1.0 - 1e-9) * body.inertia.max())  # inf of bodies that do not move
 
 
 class TurnWatch:

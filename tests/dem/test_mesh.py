@@ -265,6 +265,20 @@ def test_bodies_that_cannot_touch_a_mesh_are_refused():
         new_world(scene, SELF)
 
 
+def test_meshes_that_are_joined_or_of_materials_apart_need_no_contacts():
+    for joined in (False, True):
+        scene = Scene(friction=0.3)
+        scene.add_body("lower", [block()], material="steel")
+        place = {"position": (0, 0, 0.5), "material": "bronze"}
+        scene.add_body("upper", [block()], Dynamic(), mass=1.0, inertia=(1, 1, 1), **place)
+        if joined:
+            scene.add_joint("elbow", "lower", "upper", kind="hinge", anchor=(0, 0, 0.5), axis=(0, 1, 0))
+        else:
+            scene.set_pair("steel", "bronze", touching=0.0)
+        world = new_world(scene, SELF)
+        assert not len(find_contacts(world, 0.1))
+
+
 def test_files_are_read_written_scaled_and_refused(tmp_path):
     pytest.importorskip("trimesh")
     mesh = Mesh.revolved([(0.0, 0), (10, 0), (10, 20), (0, 20)], 16)

@@ -47,6 +47,19 @@ def test_a_wobbling_coin_keeps_its_energy(radius, height, tilt):
     assert last == pytest.approx(first, rel=0.06)
 
 
+@pytest.mark.parametrize("friction", [0.0, 0.7])
+@pytest.mark.parametrize("radii", [(0.06, 0.06, 0.012), (0.02, 0.02, 0.06), (0.15, 0.1, 0.06)])
+def test_an_ellipsoid_that_topples_rises_again(radii, friction):
+    """It presses with up to 36 times its weight on its way over its flat side; by the defaults."""
+    scene, tilt = on_floor("plane", friction), 0.2
+    tilt = np.pi / 2 - tilt if radii[0] > radii[2] else tilt  # on its edge, or upright
+    place = [0, 0, np.hypot(radii[0] * np.sin(tilt), radii[2] * np.cos(tilt))]
+    scene.add_grains(place, Superellipsoid(radii), 2000.0, quaternions=(np.cos(tilt / 2), 0, np.sin(tilt / 2), 0))
+    first, last = energies(scene, 10 * np.sqrt(max(radii) / G))
+    mass = 2000.0 * 4 / 3 * np.pi * np.prod(radii)
+    assert last - first == pytest.approx(0.0, abs=0.06 * mass * G * (max(radii) - min(radii)))
+
+
 @pytest.mark.parametrize("radii", [(0.03, 0.03, 0.015), (0.2, 0.1, 0.1), (0.05, 0.03, 0.03)])
 def test_an_ellipsoid_rocks_without_loss(radii):
     tilt = 0.5

@@ -1,0 +1,102 @@
+"""Planks rock on logs, and balls roll on planks that turn: nothing brakes them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dem import quaternion
+from dem.motion import Dynamic
+from dem.scene import Scene
+from dem.shapes import Box, Capsule, Cylinder, Mesh, Plane, Sphere
+from pctt.simulation import Simulation
+
+G, RADIUS, THICK, HALF = 9.81, 0.08, 0.015, 0.35
+ALONG_Y = (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)
+LOGS = {"capsule": Capsule(RADIUS, 0.3), "cylinder": Cylinder(RADIUS, 0.6), "ball": Sphere(RADIUS)}
+
+
+def slab():
+    """A box of triangles."""
+    corner = np.array([[x, y, z] for x in (-HALF, HALF) for y in (-0.1, 0.1) for z in (-THICK, THICK)])
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return Mesh(corner, [triangle for a, b, c, d in sides for triangle in ((a, b, c), (a, c, d))])
+
+
+PLANKS = {"box": Box((HALF, 0.1, THICK)), "coin": Cylinder(HALF, 2 * THICK), "mesh": slab()}
+
+
+def energy(sim, **bodies):
+    """Kinetic and potential [J] of bodies of these masses and moments, heights in the middle of the step."""
+    total = 0.0
+    for name, (mass, moments) in bodies.items():
+        body = sim.body(name)
+        spin = quaternion.rotate(quaternion.conjugate(body.orientation), body.velocity[3:])
+        velocity, height = body.velocity[:3], body.position[2] - 0.5 * sim.settings.dt * body.velocity[2]
+        total += 0.5 * (mass * velocity @ velocity + np.array(moments) @ spin**2) + mass * G * height
+    return total
+
+
+def swinging(plank, log, free):
+    """A plank that lies askew on a log, where it would be after rolling there from the middle. Returns its energies
+    over that of rest [J] after .3 s and 1.2 s, by the defaults."""
+    tilt, own, other = 0.12, (1.0, (0.02, 0.05, 0.06)), (3.0, (0.1, 0.1, 0.0096))
+    scene = Scene(1.0)
+    if free:
+        scene.add_body("floor", [Plane((0, 0, 1), (0, 0, -RADIUS))])
+        motion = {"motion": Dynamic(), "mass": other[0], "inertia": other[1]}
+    else:
+        motion = {}
+    scene.add_body("log", [LOGS[log]], quaternion=ALONG_Y, **motion)
+    across, along = np.array([np.sin(tilt), 0, np.cos(tilt)]), np.array([np.cos(tilt), 0, -np.sin(tilt)])
+    place = (RADIUS + THICK) * across - RADIUS * tilt * along
+    turn = (np.cos(tilt / 2), 0, np.sin(tilt / 2), 0)
+    scene.add_body("plank", [PLANKS[plank]], Dynamic(), mass=1.0, inertia=own[1], position=place, quaternion=turn)
+    sim, found, bodies = Simulation(scene, comm=MPI.COMM_SELF), [], {"plank": own, **({"log": other} if free else {})}
+    for seconds in (0.3, 1.0):
+        sim.run(until=seconds)
+        found.append(energy(sim, **bodies) - G * (RADIUS + THICK))
+    return found
+
+
+PAIRS = [("box", "capsule"), ("box", "ball"), ("coin", "cylinder"), ("mesh", "cylinder"), ("mesh", "ball")]
+
+
+@pytest.mark.parametrize(("plank", "log"), PAIRS)
+def test_a_plank_rocks_on_a_log_without_loss(plank, log):
+    early, late = swinging(plank, log, free=False)
+    assert late == pytest.approx(early, rel=0.01)
+
+
+def test_a_plank_rocks_on_a_log_that_rolls():
+    early, late = swinging("box", "cylinder", free=True)
+    assert late == pytest.approx(early, rel=0.02)
+
+
+def seesaw(friction, dt):
+    """A ball runs down a plank on a hinge. Returns the error of energy over the kinetic one, and its spin [rad/s]."""
+    radius, plank, ball = 0.04, (2.0, (0.05, 0.4, 0.4)), (1.0, (6.4e-4,) * 3)
+    scene = Scene(friction)
+    scene.add_body("plank", [Box((1.0, 0.2, 0.02))], Dynamic(), mass=plank[0], inertia=plank[1])
+    scene.add_joint("pin", None, "plank", kind="hinge", anchor=(0, 0, 0), axis=(0, 1, 0))
+    place = (0.25, 0, 0.02 + radius)
+    scene.add_body("ball", [Sphere(radius)], Dynamic(), mass=ball[0], inertia=ball[1], position=place)
+    sim = Simulation(scene, dt=dt, comm=MPI.COMM_SELF)
+    sim.step()
+    first = energy(sim, plank=plank, ball=ball)
+    sim.run(until=0.5)
+    error = energy(sim, plank=plank, ball=ball) - first
+    return error / sim.figures["kinetic_energy [J]"], sim.body("ball").velocity[4]
+
+
+def test_a_ball_without_friction_does_not_spin_on_a_plank_that_turns():
+    error, spin = seesaw(0.0, 0.004)
+    assert abs(spin) < 1e-9
+    assert abs(error) < 3e-4
+
+
+def test_a_ball_rolls_on_a_plank_that_turns():
+    error, spin = seesaw(1.0, 0.004)
+    assert spin > 10.0
+    assert abs(error) < 1.5e-3
