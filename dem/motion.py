@@ -96,9 +96,11 @@ class Driven(Dynamic, Timed):
         """c dt of a servo [kg or kg m^2], for the mass or moment, and the `speed` before the step; else 0."""
         if self.speed is None:
             return 0.0
-        most = self.strength(time, dt)
-        slip = max(DROOP * abs(self.speed), abs(self.speed - speed), 1e-6 * dt * most / mass)
-        return dt * max(most - abs(lack), 0.0) / slip if most > 0.0 else 0.0
+        most, slip = self.strength(time, dt), self.speed - speed
+        given = min(max(lack, -most), most)
+        room = most - np.copysign(given, given * slip)  # beyond what it gives without contacts, towards its speed
+        slip = abs(slip) + abs(lack - given) * dt / mass  # of what that leads to
+        return dt * room / max(slip, DROOP * abs(self.speed), 1e-6 * dt * most / mass) if most > 0.0 else 0.0
 
 
 @dataclass(frozen=True)

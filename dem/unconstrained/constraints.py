@@ -52,7 +52,7 @@ class Coupling:
     target: Floats  #: (k,) t
     bound: Floats  #: (k,) greatest impulses, inf: none
     free: Floats  #: (k,) J v*
-    slip: Floats  #: (k,) what bounded motors lose to the load that they can just bear
+    slip: Floats  #: (k,) what bounded motors lose to the load that they can just bear, with its sign
     axes: Floats  #: (constraints, 3, 3) rows x, y, z in the world
     on: Bools  #: (k,) the rows that hold
     saturated: Floats  #: (k,) impulses of the others: of motors that are too weak
@@ -111,6 +111,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     slip = np.maximum(DROOP * np.abs(left), np.abs(left - now))
     motors = np.isfinite(bound)
     slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
+    slip = np.copysign(slip, left - now)
     on, saturated = kind <= MOTOR, np.zeros(len(t))
     rows = unequal(ends.moments).nonzero()[0]
     known = ends.quaternion[rows], ends.velocity[rows, 3:], ends.moments[rows]
@@ -221,9 +222,10 @@ def _solved(
     """`solver`, `impulse`, `change` and `matrix` of a `Coupling`."""
     A = B @ B.T
     g = _impulses(A, t, free, on, saturated)
-    room = bound - np.abs(g)  # not positive where only contacts bring a motor to its speed: it is held there
+    # Beyond what motors give without contacts; not positive where only these bring one to its speed: it is held there.
+    room = bound - np.copysign(g, g * slip)
     yields = np.isfinite(bound) & (room > 0.0)
-    e = np.divide(slip, room, out=np.zeros(slip.shape), where=yields)
+    e = np.divide(np.abs(slip), room, out=np.zeros(slip.shape), where=yields)
     solver = np.zeros(A.shape)
     solver[np.ix_(on, on)] = np.linalg.pinv(A[on][:, on] + np.diag(e[on]), rcond=1e-12, hermitian=True)
     value, vector = np.linalg.eigh(B.T @ solver @ B)

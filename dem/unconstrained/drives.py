@@ -24,6 +24,7 @@ class Drives:
     """What drives, loads and springs do to the large bodies in a step."""
 
     impulse: Floats  #: (large, 6) impulses and angular impulses, of servos if nothing touches their bodies
+    pushed: Floats  #: (large, 6) what of these loads and springs give
     line: Floats  #: (large, 6) unit vectors of the lines of drives
     servo_inertia: Floats  #: (large,) what servos add to the inertia along them [kg or kg m^2], see `dem.motion.Driven`
     speed: Floats  #: (large,) that servos keep along them [m/s or rad/s]
@@ -34,9 +35,9 @@ class Drives:
     free: Floats
 
     def refound(self, impulse: Floats, velocity: Floats) -> Ints | None:
-        """``saturated`` as a step shows it to be right in which the drives gave impulses (large, 6) and which ends with
-        velocities (large, 6); None if that is what it is."""
-        along, now = (np.einsum("bi,bi->b", self.line, x) for x in (impulse, velocity))
+        """``saturated`` as a step shows it to be right in which drives, loads and springs gave impulses (large, 6) and
+        which ends with velocities (large, 6); None if that is what it is."""
+        along, now = (np.einsum("bi,bi->b", self.line, x) for x in (impulse - self.pushed, velocity))
         weak = (self.servo_inertia > 0.0) & (np.abs(along) > (1.0 + DROOP) * self.bound)
         again = np.where(self.saturated * (self.speed - now) < 0.0, 0, self.saturated)
         saturated = np.where(weak, np.sign(along).astype(int), again)
@@ -46,14 +47,15 @@ class Drives:
 def drives_of(world: World, dt: float, motion_velocities: Floats, pushed: Floats | None, saturated: Ints) -> Drives:
     """The drives of the next step of dt [s], the same on all ranks; `motion_velocities` (large, 6) are
     what motions give, `pushed` (large, 6): impulses of loads and springs, None without any."""
-    table, impulse = world.large, np.zeros(world.large.velocity.shape)
+    table = world.large
+    pushed = np.zeros(table.velocity.shape) if pushed is None else pushed
+    impulse = pushed.copy()
     line, (servo_inertia, speed, bound) = np.zeros(impulse.shape), np.zeros((3, len(impulse)))
     if not bodies.is_dynamic(table).any():
-        return Drives(impulse, line, servo_inertia, speed, bound, saturated, motion_velocities)
+        return Drives(impulse, pushed, line, servo_inertia, speed, bound, saturated, motion_velocities)
     free = falling = free_velocity(table, world.gravity, dt)
-    if pushed is not None:
-        impulse += pushed
-        free = falling + velocity_changes(table, impulse)
+    if pushed.any():
+        free = falling + velocity_changes(table, pushed)
     for row, body in enumerate(world.large_bodies):
         motion = body.motion
         if isinstance(motion, Driven):
@@ -69,7 +71,7 @@ def drives_of(world: World, dt: float, motion_velocities: Floats, pushed: Floats
     if impulse.any():
         falling = falling + velocity_changes(table, impulse)
     end = as_motions_allow(world, falling, motion_velocities)
-    return Drives(impulse, line, servo_inertia, speed, bound, saturated, end)
+    return Drives(impulse, pushed, line, servo_inertia, speed, bound, saturated, end)
 
 
 def velocities_of_motions(world: World, poses: dict[int, Pose], dt: float) -> Floats:

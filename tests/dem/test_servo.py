@@ -10,7 +10,7 @@ from mpi4py import MPI
 from dem import quaternion
 from dem.contact import find_contacts
 from dem.mesh import Mesh
-from dem.motion import Glide, Guided, Hinged
+from dem.motion import Dynamic, Glide, Guided, Hinged
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere, mass_properties
 from dem.start import new_world
@@ -151,3 +151,48 @@ def test_a_servo_gives_no_more_than_its_strength_when_its_body_strikes_a_wall():
     assert min(given) > -1e-6
     assert given[-1] == pytest.approx(500.0, rel=1.1e-3)
     assert tool.velocity[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def plate_on(scene, kind, along, strength):
+    """A plate of 10 kg with a drive of 0.05 m/s."""
+    plate = {"mass": 10.0, "inertia": (0.1, 0.1, 0.1)}
+    if kind == "guided":
+        scene.add_body("tool", [Box((0.1, 0.1, 0.1))], Guided(along, force=strength, speed=0.05), **plate)
+    else:
+        scene.add_body("tool", [Box((0.1, 0.1, 0.1))], Dynamic(), **plate)
+        slider = {"kind": "slider", "anchor": (0, 0, 0), "axis": along}
+        scene.add_joint("slider", None, "tool", **slider, speed=0.05, strength=strength)
+
+
+@pytest.mark.parametrize("kind", ["guided", "joint"])
+@pytest.mark.parametrize(
+    ("along", "load", "strength"),
+    [((0, 0, -1), 0.0, 500.0), ((0, 0, -1), 0.0, 40.0), ((1, 0, 0), 400.0, 500.0), ((1, 0, 0), -400.0, 500.0)],
+)
+def test_a_servo_that_its_load_helps_and_that_is_stopped_pushes_with_all_its_strength(kind, along, load, strength):
+    """Against a stop, by the defaults: the stop bears the strength, the weight and the load along the drive. Before it
+    the drive brakes where weight and load alone would make the plate faster than it should be in a step."""
+    scene, line = Scene(0.0), np.array(along, float)
+    scene.add_body("stop", [Box((0.1, 0.1, 0.1))], position=0.202 * line)
+    plate_on(scene, kind, along, strength)
+    if load:
+        scene.add_load("load", on="tool", force=load * line)
+    sim = Simulation(scene, comm=SELF)
+    sim.run(until=0.2)
+    assert sim.body("stop").force @ line == pytest.approx(strength - 98.1 * line[2] + load, rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["guided", "joint"])
+@pytest.mark.parametrize(("load", "against", "net"), [(-250.0, 300.0, -50.0), (300.0, 900.0, -100.0)])
+def test_a_servo_that_bears_a_load_gives_way_where_a_press_needs_more_than_its_strength(kind, load, against, net):
+    """500 N, a load on its plate, and a press of 5 kg: what is too much moves both of them."""
+    scene = Scene(0.0, gravity=(0, 0, 0))
+    plate_on(scene, kind, (1, 0, 0), 500.0)
+    scene.add_body("press", [Box((0.1, 0.1, 0.1))], Guided((-1, 0, 0), force=against), mass=5.0, position=(0.2, 0, 0))
+    scene.add_load("load", on="tool", force=(load, 0, 0))
+    sim = Simulation(scene, comm=SELF)
+    sim.run(until=0.2)
+    assert sim.body("tool").velocity[0] == pytest.approx(net / 15.0 * sim.time, rel=0.01)
+    sim.change("load load", force=(against - 400.0, 0, 0))  # now it is strong enough
+    sim.run(until=2.0)
+    assert sim.body("tool").velocity[0] == pytest.approx(0.05, rel=2e-3)
