@@ -13,7 +13,6 @@ Source: Lubachevsky, How to simulate billiards and similar systems, Journal of C
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +25,7 @@ from dem.contact import Contacts, velocities_about
 from dem.exchange import on_any
 from dem.geometry.vectors import cross, dot, plus
 from dem.model.world import World
+from dem.step.laws import slowest
 from dem.unconstrained import UnconstrainedMotion
 from dem.unconstrained.constraints import slots
 
@@ -57,7 +57,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     collective.
 
     Followed are impacts of two spheres, and of spheres that bounce from bodies that forces do not move, if they come
-    faster than a fall of one step; without restitution those of two that are near no other. Two spheres that pass each
+    faster than `slowest`; without restitution those of two that are near no other. Two spheres that pass each
     other have no contact that closes. In cells that deform, and where bodies attract each other, nothing is
     followed."""
     if world.cell.moves or world.pairs.attracts:
@@ -71,7 +71,11 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         old = old.copy()
         old[grains:] = motion.prescribed
     image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
-    slow, radius = dt * math.hypot(*world.gravity), np.ascontiguousarray(table.size[:, 0])
+    radius = np.ascontiguousarray(table.size[:, 0])
+    free = velocities_about(contacts, motion.grains, old[grains:])
+    forced = free[:, :3] - old[:, :3]
+    pressed = np.einsum("ci,ci->c", contacts.normal, forced[contacts.a] - forced[contacts.b])
+    slow = slowest(world, dt, pressed)
     kind, bounce, offset, marked = struck(
         (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
         (ball, table.mass, radius, table.material), (table.position, old),
@@ -81,15 +85,13 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         return contacts
     rows = np.stack([contacts.a, contacts.b], axis=1)
     chosen = np.flatnonzero(_reached(world, contacts, rows, kind, marked)[rows].any(axis=1))
-    free = velocities_about(contacts, motion.grains, old[grains:])
-    forced = free[:, :3] - old[:, :3]
     columns = (table.position, free, forced, radius[:, None], table.mass[:, None], table.inertia[:, :1])
     body, of = np.concatenate(columns, axis=1), rows[chosen]
     arm = contacts.point[chosen] - table.position[of[:, 1]]
     if contacts.moved is not None:
         arm -= contacts.moved[chosen]
     surface = free[of[:, 1], :3] + np.cross(free[of[:, 1], 3:], arm)
-    given = (contacts.linear_gap, bounce, contacts.friction, kind)
+    given = (contacts.linear_gap, bounce, contacts.friction, kind, slow)
     contact = np.concatenate(
         [offset[chosen], contacts.normal[chosen], surface, *(x[chosen, None] for x in given)], axis=1
     )
@@ -102,7 +104,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     state[pair[:, 0]], state[pair[:, 1]] = one, two
     more = np.bincount(pair.ravel())[pair].max(axis=1) > 1  # on all ranks together
     contact[more & (contact[:, 10] == 0.0), 12] = OTHER
-    *found, lag = followed(pair, np.ascontiguousarray(contact), state, dt, slow)
+    *found, lag = followed(pair, np.ascontiguousarray(contact), state, dt)
     here = slice(first, first + len(mine))
     late, row = lag[pair[here, 1]] - lag[pair[here, 0]], names - world.slabs[world.comm.rank]
     own = (row >= 0) & (row < near.grains)
@@ -157,12 +159,12 @@ def _reached(world: World, contacts: Contacts, rows: Ints, kind: Ints, marked: B
 @loop
 def struck(
     contacts: Touching, linear: Floats, spheres: Spheres, motions: tuple[Floats, Floats], laws: tuple[Floats, Floats],
-    grains: int, image: Floats, dt: float, slow: float,
+    grains: int, image: Floats, dt: float, slow: Floats,
 ) -> tuple[Ints, Floats, Floats, Bools]:  # fmt: skip
     """Of contacts (nc,) the kinds (nc,), the coefficients of restitution (nc,)
     and the ways from the second bodies to their images (nc, 3), of spheres `image`; and which bodies (rows,) meet by
-    the velocities before the step, or pass each other while the linear gap closes. Those that press others that they
-    touch are left out."""
+    the velocities before the step, faster than `slow` (nc,), or pass each other while the linear gap closes. Those that
+    press others that they touch are left out."""
     (one, two, normal, gap), (ball, mass, radius, material) = contacts, spheres
     (place, velocity), (restitution, stiffness) = motions, laws
     count = len(one)
@@ -180,16 +182,16 @@ def struck(
         v = velocity[b, 0] - velocity[a, 0], velocity[b, 1] - velocity[a, 1], velocity[b, 2] - velocity[a, 2]
         closed, closes, bounce[c] = gap[c] <= 0.0, linear[c] + dt * dot(v, n) < 0.0, e
         if ball[a] and b >= grains and e > 0.0 and np.isinf(mass[b]):
-            kind[c], meets[c] = WALL, closes and dot(v, n) < -slow
+            kind[c], meets[c] = WALL, closes and dot(v, n) < -slow[c]
         elif ball[a] and ball[b] and (e > 0.0 or (many[a] == many[b] == 1 and _is_short(k, mass, a, b, dt))):
             offset[c] = image[c]
             time, speed = _meeting(_branch(place, a, b, offset, c), v, radius[a] + radius[b])
-            kind[c], meets[c] = PAIR, time <= dt and speed < -slow
+            kind[c], meets[c] = PAIR, time <= dt and speed < -slow[c]
             passes[c] = closes and not closed
         if meets[c]:
             for i in range(3):
                 push[a, i], push[b, i] = -n[i], n[i]
-        elif closed and not (kind[c] == PAIR and dot(v, n) > slow):  # not two that an impact has just parted
+        elif closed and not (kind[c] == PAIR and dot(v, n) > slow[c]):  # not two that an impact has just parted
             kind[c], touches[a], touches[b] = OTHER, True, True
     for c in range(count):
         if kind[c] == OTHER and gap[c] <= 0.0:
@@ -208,13 +210,13 @@ def struck(
 
 @loop
 def followed(
-    pair: Ints, contact: Floats, state: Floats, dt: float, slow: float
+    pair: Ints, contact: Floats, state: Floats, dt: float
 ) -> tuple[Bools, Floats, Floats, Floats, Floats]:
     """Follow the impacts of contacts of the bodies `pair` (nc, 2) through a step of dt [s].
 
-    contact (nc, 13): way from body b to its image (3), normal (3), velocity of the surface of b (3), linear gap,
-    restitution, friction, kind. state (n, 15): place (3), velocities of the step without contacts (6), the change of
-    the linear ones by forces (3), radius, mass, moment of inertia.
+    contact (nc, 14): way from body b to its image (3), normal (3), velocity of the surface of b (3), linear gap,
+    restitution, friction, kind, what `slowest` says. state (n, 15): place (3), velocities of the step without contacts
+    (6), the change of the linear ones by forces (3), radius, mass, moment of inertia.
 
     Returns which contacts (nc,) have impacts, their normal velocities after the last one (nc,), the gaps at the end
     (nc,), NaN where they are left to the step, and the normals of pairs that meet (nc, 3), else zero; and by how much
@@ -228,7 +230,7 @@ def followed(
     while again:
         now[:], normal[:], times[:], again = state[:, :9], 0.0, 0, False
         for c in range(len(pair)):
-            coming[c] = _next(c, pair, contact, state, now, left, 0.0, dt, slow)
+            coming[c] = _next(c, pair, contact, state, now, left, 0.0, dt)
         while len(pair):
             c = int(np.argmin(coming))
             t = coming[c]
@@ -245,14 +247,14 @@ def followed(
                 normal[c, 0], normal[c, 1], normal[c, 2] = n
             for side in range(2 if contact[c, 12] == PAIR else 1):
                 for k in range(start[pair[c, side]], start[pair[c, side] + 1]):
-                    coming[link[k]] = _next(link[k], pair, contact, state, now, left, t, dt, slow)
+                    coming[link[k]] = _next(link[k], pair, contact, state, now, left, t, dt)
         if again:
             continue
         flies[:] = ~left
         for c in range(len(pair)):
             a, b = pair[c, 0], pair[c, 1]
             if contact[c, 12] == OTHER or left[a] or (contact[c, 12] == PAIR and left[b]):
-                acts, of_impacts = _acts(c, pair, contact, state, now, dt, slow)
+                acts, of_impacts = _acts(c, pair, contact, state, now, dt)
                 flies[a], flies[b] = flies[a] and not acts, flies[b] and not acts
                 if of_impacts and not (left[a] and left[b]):
                     left[a], left[b], again = True, True, True
@@ -341,7 +343,7 @@ def _relative(c, pair, contact, state, now):
 
 
 @inlined
-def _next(c, pair, contact, state, now, left, begin, dt, slow):
+def _next(c, pair, contact, state, now, left, begin, dt):
     """When the bodies of a contact meet next, from the time `begin` on; infinite if not in the step."""
     a, b = pair[c, 0], pair[c, 1]
     if contact[c, 12] == OTHER or left[a] or (contact[c, 12] == PAIR and left[b]):
@@ -359,7 +361,7 @@ def _next(c, pair, contact, state, now, left, begin, dt, slow):
             root = np.sqrt(root)
             later = -(speed + root) / bend if speed >= 0.0 else max(2.0 * gap / (root - speed), 0.0)
             speed += bend * later
-    enough = speed < -slow - ROUNDING * np.sqrt(dot(v, v))
+    enough = speed < -contact[c, 13] - ROUNDING * np.sqrt(dot(v, v))
     return begin + later if enough and begin + later <= dt else np.inf
 
 
@@ -397,7 +399,7 @@ def _bounce(c, pair, contact, state, now, time, dt):
 
 
 @inlined
-def _acts(c, pair, contact, state, now, dt, slow):
+def _acts(c, pair, contact, state, now, dt):
     """Whether a contact that is not followed closes in the step, faster than bodies at rest do; and whether its bodies
     are in impacts then, or it closes by them."""
     branch, v, _ = _relative(c, pair, contact, state, now)
@@ -413,5 +415,5 @@ def _acts(c, pair, contact, state, now, dt, slow):
     closes = contact[c, 9] + dot(far, n) < 0.0
     if contact[c, 12] == PAIR:
         closes = np.sqrt(dot(far, far)) < state[pair[c, 0], 12] + state[pair[c, 1], 12]
-    fast = loaded < -LOADS * most or dot(v, n) - loaded < -2.0 * slow - LOADS * most
+    fast = loaded < -LOADS * most or dot(v, n) - loaded < -2.0 * contact[c, 13] - LOADS * most
     return closes and fast, closes and fast and most > 0.0

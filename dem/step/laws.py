@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,3 +32,9 @@ def along_normal(size: Floats) -> Floats:
     out = np.zeros((len(size), 3))
     out[:, 0] = size
     return out
+
+
+def slowest(world: World, dt: float, pressed: Floats) -> Floats:
+    """The speeds (nc,) with which bodies come that rest [m/s]: those of a fall of one step, or what forces add in the
+    step to the speed with which a contact closes, `pressed` (nc,), if that is more. Such bodies do not bounce."""
+    return np.maximum(dt * math.hypot(*world.gravity), pressed)

@@ -15,7 +15,6 @@ Source: Anitescu and Hart (2004), Tasora and Anitescu (2011): the cone complemen
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -34,7 +33,7 @@ from dem.free_motion import kept_spin
 from dem.model.world import World
 from dem.parts.laws import Solved
 from dem.start import stiffness
-from dem.step.laws import along_normal, contact_state
+from dem.step.laws import along_normal, contact_state, slowest
 from dem.step.resistance import resistance
 from dem.step.servo import cell_of
 from dem.step.surface import surface_velocities
@@ -207,15 +206,15 @@ class ContactSystem:
     ) -> None:
         """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton).
 
-        They begin if without impulses they close in the step, `freely` (nc,) [m/s], and come faster than a fall of one
-        step: a body at rest does not bounce."""
+        They begin if without impulses they close in the step, `freely` (nc,) [m/s], and come faster than `slowest`: a
+        body at rest does not bounce."""
         table, a, b = contacts.near.bodies, contacts.a, contacts.b
         e = world.pairs.restitution[table.material[a], table.material[b]]
         came = self.contact_map.relative_velocities(table.velocity)[:, 0]
         if self.drift is not None:
             came = came + self.drift[:, 0]
         closes = contacts.linear_gap + self.dt * freely < 0.0
-        begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & closes
+        begin = (e > 0.0) & (came < -slowest(world, self.dt, came - freely)) & closes
         if contacts.parting is not None:
             begin &= np.isnan(contacts.parting)
         self.at_once, self._bounces = int(begin.sum()), begin

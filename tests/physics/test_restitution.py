@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import pctt
+from dem.motion import Guided
 from dem.scene import Scene
-from dem.shapes import Plane
+from dem.shapes import Box, Plane, Sphere
 
 R, DENSITY, G = 0.1, 2500.0, 9.81
 EXACT = {"tol": 1e-10, "closing_work": np.inf}
@@ -66,6 +67,41 @@ def test_bodies_at_rest_do_not_bounce():
     with pctt.Simulation(scene, dt=0.005, solver="apgd", **EXACT) as sim:
         sim.run(steps=200)
         assert sim.kinetic_energy < 1e-12
+
+
+PRESSED = {  # what presses a body of 10 kg on a floor with some 10 g, and with which weight beside it
+    "load": 0.0, "load beside gravity": G, "spring": 0.0, "press": 0.0, "cohesion": 0.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("shape", ["sphere", "box"])
+@pytest.mark.parametrize("by", PRESSED)
+def test_what_forces_press_on_a_floor_comes_to_rest(shape, by):
+    """Whatever presses a body: it falls by 1 mm and bounces to lesser and lesser heights, for 0.1 s in all. Then the
+    floor bears the forces in every step."""
+    push, weight = 981.0, 10.0 * PRESSED[by]
+    law = {"cohesion": push, "cohesion_range": 0.01} if by == "cohesion" else {}
+    scene = Scene(0.3, gravity=(0, 0, -PRESSED[by]), restitution=0.8, **law)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    place = [0, 0, R + 1e-3]
+    if by == "press":
+        head = [Box((R, R, R))] if shape == "box" else [Sphere(R)]
+        scene.add_body("press", head, Guided((0, 0, -1), force=push), mass=10.0, position=place)
+    elif shape == "box":
+        scene.add_boxes([place], (R, R, R), 10.0 / (8 * R**3))
+    else:
+        scene.add_spheres([place], R, 10.0 / (4 / 3 * np.pi * R**3))
+    if by.startswith("load"):
+        scene.add_load("push", force=(0, 0, -push))
+    if by == "spring":
+        scene.add_spring("push", None, 0, anchor=(0, 0, 5.0), stiffness=2.0, length=4.9 + push / 2.0)
+    with pctt.Simulation(scene) as sim:
+        sim.run(until=0.5)
+        borne = [0.0 if by == "cohesion" else push + weight] * 10
+        found = []
+        sim.run(steps=10, call=lambda sim: found.append(-sim.body("floor").force[2]))
+        np.testing.assert_allclose(found, borne, rtol=2e-3, atol=1e-3 * push)
+        assert sim.kinetic_energy < 1e-7
 
 
 @pytest.mark.parametrize("bad", [-0.1, 1.5])
