@@ -146,7 +146,7 @@ def energy_balance(step: Step) -> dict[str, float]:
         comm, kinetic_before=was[0], potential_before=was[1], kinetic=now[0], potential=now[1], falling=falling,
         normal=normal, tangential=tangential, elastic=elastic, elastic_at_end=elastic_at_end, strained=strained,
         strained_at_end=strained_at_end, still=still, least=least, carried=_carried(step, ~moves), attracted=attracted,
-        applied=applied, belts=belts, flow=flow,
+        applied=applied, belts=belts, flow=flow, bounced=_bounced_work(step),
     )  # fmt: skip
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
     held_by, held_at_end = _constraint_works(step, before[0].velocity, mean)
@@ -158,6 +158,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     held, bent = whole["elastic_at_end"] - whole["elastic"], whole["strained_at_end"] - whole["strained"]
     pulled, released = 2.0 * max(whole["attracted"], 0.0), max(-held, 0.0) + max(-bent, 0.0)
     pulled += max(held_at_end - held_by, 0.0)  # with the velocity of the end, for bodies that were at rest
+    pulled += max(whole["bounced"], 0.0)
     there = whole["kinetic_before"] + whole["still"] + whole["carried"]
     stored = whole["elastic"] + whole["strained"]
     created = rise - fallen - work - released - pulled > CREATED * (there + stored + abs(work))
@@ -177,6 +178,13 @@ def energy_balance(step: Step) -> dict[str, float]:
         "time_stepping [J]": made,
         "energy_jump [J]": broadcast(comm, rise if jumps else 0.0),  # what follows from it is the same on all ranks
     }
+
+
+def _bounced_work(step: Step) -> float:
+    """What loads and springs do on the way of grains that ends beside that of their mean velocities, as impacts are
+    within the step [J]: bodies that come and go as fast may have fallen in between."""
+    applied, lag = step.system.applied, step.contacts.lag
+    return 0.0 if applied is None or lag is None else float(np.vdot(applied.grains[:, :3], lag)) / step.system.dt
 
 
 def _each(pairs: Iterable[tuple[float, float]]) -> tuple[float, float]:

@@ -104,6 +104,27 @@ def test_what_forces_press_on_a_floor_comes_to_rest(shape, by):
         assert sim.kinetic_energy < 1e-7
 
 
+@pytest.mark.parametrize("by", ["load", "spring"])
+def test_a_ball_bounces_under_a_load_as_under_gravity_and_makes_no_energy(by):
+    """Between an impact and the end of its step a force may do more than its work on the mean of the two velocities."""
+    found, strong = [], 98.1
+    for press in ("gravity", by):
+        scene = Scene(0.3, gravity=(0, 0, -strong if press == "gravity" else 0.0), restitution=0.8)
+        scene.add_body("floor", [Plane((0, 0, 1))])
+        scene.add_spheres([[0, 0, R + 1e-3]], R, 1.0 / (4 / 3 * np.pi * R**3))
+        if press == "load":
+            scene.add_load("push", force=(0, 0, -strong))
+        elif press == "spring":
+            scene.add_spring("push", None, 0, anchor=(0, 0, 5.0), stiffness=1e-3, length=4.9 + strong * 1e3)
+        with pctt.Simulation(scene, dt=6.8e-4, stiffness=1e7) as sim:
+            heights = []
+            for _ in range(40):
+                assert sim.step()["energy_jump [J]"] == 0.0
+                heights.append(sim.positions[0, 2])
+        found.append(heights)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-8)
+
+
 @pytest.mark.parametrize("bad", [-0.1, 1.5])
 def test_a_coefficient_is_between_0_and_1(bad):
     with pytest.raises(ValueError, match="restitution must be from 0 to 1"):
