@@ -74,8 +74,8 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     radius = np.ascontiguousarray(table.size[:, 0])
     free = velocities_about(contacts, motion.grains, old[grains:])
     forced = free[:, :3] - old[:, :3]
-    pressed = np.einsum("ci,ci->c", contacts.normal, forced[contacts.a] - forced[contacts.b])
-    slow = slowest(world, dt, pressed)
+    closing = np.einsum("ci,ci->c", contacts.normal, forced[contacts.a] - forced[contacts.b])
+    slow = slowest(world, contacts, dt, closing, forced)
     kind, bounce, offset, marked = struck(
         (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
         (ball, table.mass, radius, table.material), (table.position, old),

@@ -34,7 +34,10 @@ def along_normal(size: Floats) -> Floats:
     return out
 
 
-def slowest(world: World, dt: float, pressed: Floats) -> Floats:
-    """The speeds (nc,) with which bodies come that rest [m/s]: those of a fall of one step, or what forces add in the
-    step to the speed with which a contact closes, `pressed` (nc,), if that is more. Such bodies do not bounce."""
-    return np.maximum(dt * math.hypot(*world.gravity), pressed)
+def slowest(world: World, contacts: Contacts, dt: float, closing: Floats, forced: Floats) -> Floats:
+    """The speeds (nc,) with which bodies come that rest [m/s], as others on them may press them: those of a fall of one
+    step, or what forces add in the step to the velocity of one of the two, `forced` (rows, 3), or to the speed with
+    which the contact closes, `closing` (nc,). Such bodies do not bounce."""
+    push = np.sqrt(np.einsum("ri,ri->r", forced, forced))
+    of_one = np.maximum(push[contacts.a], push[contacts.b])
+    return np.maximum(np.maximum(closing, of_one), dt * math.hypot(*world.gravity))

@@ -186,6 +186,8 @@ class ContactSystem:
         free, self.middle = free_velocities(world, self.near, self.motion, change)
         if self.applied is not None or change is not None:
             self.contact_map.halo.update(free)
+        moves = bodies.is_dynamic(self.near.bodies)[:, None]
+        self._forced = np.where(moves, free[:, :3] - self.near.bodies.velocity[:, :3], 0.0)  # not by constraints
         freely, rounding = closing(given.frame, given.arm, row, free)
         if self.coupling is not None:
             here, slot = slots(world, self.near.bodies.id)
@@ -214,7 +216,8 @@ class ContactSystem:
         if self.drift is not None:
             came = came + self.drift[:, 0]
         closes = contacts.linear_gap + self.dt * freely < 0.0
-        begin = (e > 0.0) & (came < -slowest(world, self.dt, came - freely)) & closes
+        slow = slowest(world, contacts, self.dt, came - freely, self._forced)
+        begin = (e > 0.0) & (came < -slow) & closes
         if contacts.parting is not None:
             begin &= np.isnan(contacts.parting)
         self.at_once, self._bounces = int(begin.sum()), begin

@@ -104,6 +104,19 @@ def test_what_forces_press_on_a_floor_comes_to_rest(shape, by):
         assert sim.kinetic_energy < 1e-7
 
 
+def test_a_heap_that_a_load_presses_comes_to_rest():
+    """Those that touch each other bear what presses the others, and do not bounce, as under gravity."""
+    scene = Scene(0.3, gravity=(0, 0, 0), restitution=0.7)
+    sides = np.concatenate([np.eye(3), -np.eye(3)])
+    scene.add_body("box", [Plane(tuple(side), tuple(-3.6 * R * side)) for side in sides])
+    scene.add_spheres(2.4 * R * (np.indices((3, 3, 3)).reshape(3, -1).T - 1.0), R, 1.0 / (4 / 3 * np.pi * R**3))
+    scene.add_load("wind", force=(-0.5 * G, 0, -G))
+    with pctt.Simulation(scene) as sim:
+        sim.run(until=2.5)
+        assert sim.kinetic_energy < 1e-9
+        np.testing.assert_allclose(sim.body("box").force, [-13.5 * G, 0, -27 * G], atol=0.01 * G)
+
+
 @pytest.mark.parametrize("by", ["load", "spring"])
 def test_a_ball_bounces_under_a_load_as_under_gravity_and_makes_no_energy(by):
     """Between an impact and the end of its step a force may do more than its work on the mean of the two velocities."""
