@@ -67,12 +67,13 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     ball = table.shape == SPHERE
     ball[grains:] = False
     ball[slots(world, table.id)[0]] = False
-    if pairs.restitution.any():
+    bounces = bool(pairs.restitution.any())
+    if bounces:
         old = old.copy()
         old[grains:] = motion.prescribed
     image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     radius = np.ascontiguousarray(table.size[:, 0])
-    free = velocities_about(contacts, motion.grains, old[grains:])
+    free = velocities_about(contacts, motion.grains, old[grains:]) if bounces else old
     forced = free[:, :3] - old[:, :3]
     closing = np.einsum("ci,ci->c", contacts.normal, forced[contacts.a] - forced[contacts.b])
     slow = slowest(world, contacts, dt, closing, forced)
@@ -85,6 +86,9 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         return contacts
     rows = np.stack([contacts.a, contacts.b], axis=1)
     chosen = np.flatnonzero(_reached(world, contacts, rows, kind, marked)[rows].any(axis=1))
+    if not bounces:
+        free = velocities_about(contacts, motion.grains, old[grains:])
+        forced = free[:, :3] - old[:, :3]
     columns = (table.position, free, forced, radius[:, None], table.mass[:, None], table.inertia[:, :1])
     body, of = np.concatenate(columns, axis=1), rows[chosen]
     arm = contacts.point[chosen] - table.position[of[:, 1]]

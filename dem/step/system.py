@@ -186,8 +186,9 @@ class ContactSystem:
         free, self.middle = free_velocities(world, self.near, self.motion, change)
         if self.applied is not None or change is not None:
             self.contact_map.halo.update(free)
-        moves = bodies.is_dynamic(self.near.bodies)[:, None]
-        self._forced = np.where(moves, free[:, :3] - self.near.bodies.velocity[:, :3], 0.0)  # not by constraints
+        if world.pairs.restitution.any():
+            moves = bodies.is_dynamic(self.near.bodies)[:, None]
+            self._forced = np.where(moves, free[:, :3] - self.near.bodies.velocity[:, :3], 0.0)  # not by constraints
         freely, rounding = closing(given.frame, given.arm, row, free)
         if self.coupling is not None:
             here, slot = slots(world, self.near.bodies.id)
