@@ -20,9 +20,10 @@ along each other in the step, the term with dt/2, is foreseen and added (`Contac
 with another one does not creep on it. Bodies of prescribed motion have the arms of the end, as normals: a tool does the
 work that its force does at the speed of its face.
 
-Round bodies on a flat face that impulses move have its normal of the start, too. The normal turns with the face, and
-the place goes along the face as it rolls on them: with the normal of the end, and arms along it, each step would take
-energy from a plank that rocks on a log, to first order.
+Large round bodies on a flat face that impulses move have its normal of the start, too. The normal turns with the face,
+and the place goes along the face as it rolls on them: with the normal of the end, and arms along it, each step would
+take energy from a plank that rocks on a log, to first order. Where the face rests on round grains, that of the end damps
+what trembles.
 
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found

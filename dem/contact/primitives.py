@@ -254,14 +254,14 @@ def touches_ahead(
 
 def on_faces(table: Primitives, one: Ints, two: Ints, found: Manifold, moves: Bools, grains: int) -> Bools:
     """Which contacts (nc,) of the rows `one` and `two` (nc,) are of round guests on flat faces of hosts that impulses
-    move, by the rows of bodies `moves`. Not of two grains: in beds energy would grow."""
+    move, by the rows of bodies `moves`. Grains are no guests: what rests on a bed of them would tremble."""
     kind, flat = table.kind, np.zeros(len(one), np.bool_)
     if not (faces := moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)).any():
         return flat
     swap = hosts_first(kind[one], kind[two])
     guest, host = np.where(swap, two, one), np.where(swap, one, two)
     is_round = (kind[guest] == SPHERE) | (kind[guest] == CAPSULE) | (kind[guest] >= CONVEX)
-    rows = np.flatnonzero(faces[host] & is_round & (table.row[two] >= grains))  # large bodies are the second ones
+    rows = np.flatnonzero(faces[host] & is_round & (table.row[guest] >= grains))
     away = found.touch.normal * np.where(swap, 1.0, -1.0)[:, None]
     flat[rows[kind[host[rows]] == PLANE]] = True
     for row in table.surfaces:
