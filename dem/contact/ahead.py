@@ -22,8 +22,8 @@ work that its force does at the speed of its face.
 
 Large round bodies on a flat face that impulses move have its normal of the start, too. The normal turns with the face,
 and the place goes along the face as it rolls on them: with the normal of the end, and arms along it, each step would
-take energy from a plank that rocks on a log, to first order. Where the face rests on round grains, that of the end damps
-what trembles.
+take energy from a plank that rocks on a log, to first order. What rests on round grains keeps that of the end, which
+damps it.
 
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
