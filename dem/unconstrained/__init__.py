@@ -15,7 +15,7 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.checks import positive
-from dem.free_motion import fallen, free_spin, free_velocity, gyroscopic, velocity_changes
+from dem.free_motion import falling, free_velocity, spin_freely, velocity_changes
 from dem.model.neighbourhood import Neighbourhood
 from dem.model.world import World
 from dem.motion import Pose
@@ -88,8 +88,8 @@ def free_velocities(
     right; and the angular ones (owned, 3) about which they are linear in the impulses, see
     `dem.free_motion.free_spin`, NaN where they are so anywhere. None without a `change` (owned, 6), what contacts are
     expected to change."""
-    velocity, _ = fallen(near.bodies, world.gravity, free.dt)
-    first = near.grains + near.ghosts
+    table, first = near.bodies, near.grains + near.ghosts
+    velocity, _ = falling(table.velocity, table.mass, table.shape, world.gravity, free.dt)
     pushed = None
     if free.applied is not None:
         pushed = velocity_changes(world.grains, free.applied.grains)
@@ -98,14 +98,9 @@ def free_velocities(
     if change is None:
         return velocity, None
     owned = len(change)
-    spin_change, middle = np.zeros((owned, 3)), np.full((owned, 3), np.nan)
+    given = np.zeros((owned, 3))
     if pushed is not None:
-        spin_change[: near.grains] = pushed[:, 3:]
-    if owned > near.grains:  # of the last rank, which has no ghosts
-        spin_change[near.grains :] = velocity_changes(world.large, free.drives.impulse)[:, 3:]
-    own = near.bodies.take(slice(owned))
-    rows = gyroscopic(own)
-    now = own.quaternion[rows], own.velocity[rows, 3:], own.inertia[rows]
-    spin, middle[rows] = free_spin(*now, free.dt, (spin_change + change[:, 3:])[rows])
-    velocity[rows, 3:] = spin + spin_change[rows]
-    return velocity, middle
+        given[: near.grains] = pushed[:, 3:]
+    if owned > near.grains and free.drives.impulse.any():  # of the last rank, which has no ghosts
+        given[near.grains :] = velocity_changes(world.large, free.drives.impulse)[:, 3:]
+    return velocity, spin_freely(table, velocity, given, change, free.dt)
