@@ -207,17 +207,16 @@ class ContactMap:
         """D' v (nc, 3) for the velocities (rows, 6) of all rows of a table of the halo, without a message."""
         return loops.relative_velocities(*self._arrays, v)
 
-    def works(self, g: Floats, v: Floats, new_v: Floats) -> tuple[float, float, Floats]:
+    def works(self, g: Floats, v: Floats, new_v: Floats) -> tuple[float, float, Floats, Floats]:
         """The work of normal and of tangential impulses g (nc, 3) on the mean of two velocities (rows, 6) of all rows
-        of a table of the halo, and the normal velocities (nc,) of the second, without a message."""
+        of a table of the halo, and the normal velocities (nc,) of both, without a message."""
         return loops.works(*self._arrays, g, v, new_v)
 
-    def sums_of_impulses(self, g: Floats, contacts: Ints) -> Floats:
-        """D g (rows, 6) of these of this rank's contacts, by rows of a table of the halo, without a message."""
+    def sums_of_impulses(self, g: Floats, first: int = 0) -> Floats:
+        """D g (rows, 6) of those of this rank's contacts whose second body is in the row `first` or behind it, by rows
+        of a table of the halo, without a message."""
         sums = np.zeros((self.halo.rows, 6))
-        g = self._floats(shaped("impulses", g, self.rows, 3))
-        frame, arm, body = self._arrays
-        loops.add_momenta(frame[contacts], arm[contacts], body[contacts], g[contacts], sums, np.zeros(0))
+        loops.add_momenta_on(first, *self._arrays, self._floats(shaped("impulses", g, self.rows, 3)), sums)
         return sums
 
     def _enter(self, v: Floats) -> None:

@@ -317,9 +317,9 @@ class ContactSystem:
         """Impulses and angular impulses D g (large, 6) on the large bodies, the same on all ranks, from the impulses
         and the moments of `dem.step.resistance` (nc, 3) of all ranks [N s, N m s]; collective."""
         first = self.near.grains + self.near.ghosts
-        rows = (self.contact_map.body[:, 1] >= first).nonzero()[0]  # body b has the higher id
-        sums = self.contact_map.sums_of_impulses(impulse, rows)
+        sums = self.contact_map.sums_of_impulses(impulse, first)  # body b has the higher id
         if moment is not None and self.resistance is not None:
+            rows = (self.contact_map.body[:, 1] >= first).nonzero()[0]
             self.resistance.map.sums_of_moments(moment, rows, sums)
         large = sums[first:].copy()
         self.contact_map.comm.Allreduce(MPI.IN_PLACE, large)

@@ -21,7 +21,7 @@ from scipy.sparse.linalg import LinearOperator, splu
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
 from dem.exchange import on_any, on_each, reduced, refuse
-from pctt.arrays import Array
+from pctt.arrays import Array, all_from
 from pctt.ccp.cones import Cones
 from pctt.ccp.delassus import BlockMap, ColumnMap, GivenMatrix, GivenOperator, rows_of
 
@@ -130,6 +130,8 @@ def kind_of(given: Any) -> int:
     other."""
     if given is None:
         return 0
+    if isinstance(given, np.ndarray):
+        return 4 if given.ndim == 2 else 5
     if isinstance(given, PETSc.Object):
         return 1
     if isinstance(given, (BlockRows, CompactRows, ContactMap)):
@@ -181,10 +183,8 @@ def _wrong_contacts(
             words = " or ".join(map(str, allowed))
             return f"{name} has the shape {np.shape(given)}; allowed is {words}, as r has {nc} contacts"
     for name, numbers, least in (("r", velocity, -np.inf), ("mu", friction, 0.0), ("compliance", soft, 0.0)):
-        if np.isfinite(numbers.sum()) and numbers.min(initial=0.0) >= least:
-            continue
-        wrong = np.flatnonzero(~(np.isfinite(numbers) & (numbers >= least)))
-        if len(wrong):  # else it is the sum alone that is too large
+        if not all_from(numbers.ravel(), least):
+            wrong = np.flatnonzero(~(np.isfinite(numbers) & (numbers >= least)))
             per = max(numbers.size // max(nc, 1), 1)
             more = f" and {len(wrong) - 1} more numbers" if len(wrong) > 1 else ""
             kind = "finite numbers" + " >= 0" * (least == 0.0)
@@ -205,6 +205,8 @@ def _wrong_contacts(
 
 def _real(given: Any) -> Array:
     """An array of float64; TypeError for complex numbers."""
+    if isinstance(given, np.ndarray) and given.dtype == float:
+        return given
     if np.iscomplexobj(given):
         raise TypeError("complex numbers")
     return np.asarray(given, dtype=float)

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from dem.compiled import loop
 from dem.contact_map import BlockRows
 from dem.exchange import reduced, refuse
-from pctt.arrays import TINY, Array
+from pctt.arrays import TINY, Array, all_from
 from pctt.ccp import door
 from pctt.ccp.cones import Cones, FrictionCones
 from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, ritz_values, without_dense_columns
@@ -101,20 +101,17 @@ class ConeProblem:
         self.comm, self.key = comm, key
         self._curvature: list[float] = []  # shared with problems of other r
         self.point = None if point is None else np.concatenate([point] * self.cones.parts)
-        self.compliance = np.zeros(self.r.shape)
-        self.compliance[: self.cones.count] = compliances(compliance, self.cones.count)
+        self.compliance = compliances(compliance, self.cones.count, len(self.r))
         self.operator = self._given_operator = door.operator_of(comm, len(self.r), contacts.width, N, G, masses)
         if self.units is not None:
             self.operator = door.in_units(comm, self._given_operator, self.units)
         self.contact_map = None if isinstance(self.operator, GivenOperator) else self.operator
-        trace = _diagonals(self._rigid_blocks).sum()  # has squares of all numbers of G
-        known = self.contact_map is not None and np.isfinite(trace)
+        trace = float(_diagonals(self._rigid_blocks).sum())  # has squares of all numbers of G
+        known = self.contact_map is not None and math.isfinite(trace)
         wrong = 0 if known else _not_finite(self._rigid_blocks)
-        unanswered = np.count_nonzero(~(_diagonals(self._rigid_blocks) + self.compliance).any(axis=1))
-        soft = self.compliance.max(initial=0.0) > 0.0
-        here = np.array([wrong, self.cones.count, soft, self.r.size, unanswered, trace])
-        *counts, trace = self.sum(here).tolist()
-        wrong, self.size, soft, rows, self.unanswered = map(int, counts)
+        here = wrong, self.cones.count, *_rows_with(self._rigid_blocks, self.compliance), self.r.size, trace
+        (*counts, trace), _ = reduced(comm, here, ())
+        wrong, self.size, soft, self.unanswered, rows = map(int, counts)
         if wrong:
             self.destroy()
             raise ValueError(f"G has a NaN or an infinite number in {wrong} contacts")
@@ -163,18 +160,18 @@ class ConeProblem:
     def taken(self, what: str, impulse: Any, finite: bool = False) -> Array:
         """Impulses (nc, 3) in the cones from the user's, which may be flat. ValueError on all ranks for another shape,
         and for what are no numbers, or no ``finite`` ones. Collective."""
-        found = none = self.shown(np.zeros(self.r.shape))
-        wrong = ""
+        shape, wrong = (len(self.r), self._width), ""
+        found = np.zeros(shape)
         try:
             found = np.ascontiguousarray(impulse, dtype=float)
         except (TypeError, ValueError) as error:
             wrong = f"{what} of no numbers: {error}"
-        if finite and not np.isfinite(found).all():
+        if finite and not all_from(found.ravel(), -np.inf):
             wrong = f"{what} with a NaN or an infinite number"
-        if found.shape not in (none.shape, (none.size,)):
-            wrong = f"{what} of shape {found.shape}; allowed is {none.shape}"
+        if found.shape not in (shape, (len(self.r) * self._width,)):
+            wrong = f"{what} of shape {found.shape}; allowed is {shape}"
         refuse(self.comm, wrong)
-        return self.in_cones(found.reshape(none.shape))
+        return self.in_cones(found.reshape(shape))
 
     def in_cones(self, impulse: Array) -> Array:
         """Impulses (nc, 3) in the cones from the user's."""
@@ -374,22 +371,36 @@ class ConeProblem:
             self.__dict__.pop("N").destroy()
 
 
-def compliances(compliance: Array | float, contacts: int) -> Array:
-    """The diagonal of C (nc, 3), of so many contacts, from what a `ConeProblem` takes as the compliance."""
-    given = np.asarray(compliance, dtype=float)
+def compliances(compliance: Array | float, contacts: int, rows: int) -> Array:
+    """The diagonal of C (rows, 3), of so many contacts in the first rows, from what a `ConeProblem` takes as the
+    compliance."""
+    out, given = np.zeros((rows, 3)), np.asarray(compliance, dtype=float)
     if given.ndim == 2:
-        return _with_both_tangents(np.ascontiguousarray(given))
-    out = np.zeros((contacts, 3))
-    out[:, 0] = given
+        _put_both_tangents(np.ascontiguousarray(given), out)
+    else:
+        out[:contacts, 0] = given
     return out
 
 
 @loop
-def _with_both_tangents(given: Array) -> Array:
-    out = np.empty((len(given), 3))
+def _put_both_tangents(given: Array, out: Array) -> None:
     for c in range(len(given)):
         out[c, 0], out[c, 1], out[c, 2] = given[c, 0], given[c, 1], given[c, 1]
-    return out
+
+
+@loop
+def _rows_with(blocks: Array, compliance: Array) -> tuple[int, int]:
+    """How many rows (n, 3) of C have compliance, and in how many the diagonal of N is zero, for the rigid blocks
+    (n, 3, 3)."""
+    soft, unanswered = 0, 0
+    for c in range(len(compliance)):
+        gives = False
+        answers = False
+        for k in range(3):
+            gives = gives or compliance[c, k] > 0.0
+            answers = answers or not blocks[c, k, k] + compliance[c, k] == 0.0
+        soft, unanswered = soft + gives, unanswered + (not answers)
+    return soft, unanswered
 
 
 def _number(x: float) -> float:

@@ -24,7 +24,7 @@ from dem.arrays import Floats
 from dem.compiled import loop
 from dem.exchange import reduced
 from dem.model.world import World
-from dem.record.energies import energy
+from dem.record.energies import add_kinetic
 from dem.step.islands import contacts_at_rest
 from dem.step.system import ContactSystem
 from pctt.arrays import Array
@@ -89,16 +89,11 @@ def account(world: World, limits: Limits, result: Result) -> None:
 def _kinetic_part(world: World, system: ContactSystem) -> float:
     """The kinetic energy of the bodies over that which a step of free motion would give them; inf where a tool, a belt
     or a flow passes them faster than that. Collective."""
-    grains, large, free = world.grains, world.large, system.free_large
-    moves = bodies.is_dynamic(large).nonzero()[0]
-    driven = large.take(moves)
-    first = float(world.comm.rank == 0)  # all ranks know the large bodies, and processors may round otherwise
-    sums = (
-        energy(grains, world.gravity)[0] + first * energy(driven, world.gravity)[0],
-        falling_energy(grains.mass, grains.velocity, system.free_velocity[: len(grains)])
-        + first * falling_energy(driven.mass, driven.velocity, free[moves]),
-        float(grains.mass.sum() + first * driven.mass.sum()),
-    )
+    grains, large = world.grains, world.large
+    sums = energies_of_fall(grains.quaternion, grains.velocity, grains.mass, grains.inertia, system.free_velocity)
+    if world.comm.rank == 0:  # all ranks know the large bodies, and processors may round otherwise
+        of_large = energies_of_fall(large.quaternion, large.velocity, large.mass, large.inertia, system.free_large)
+        sums = [one + other for one, other in zip(sums, of_large)]
     (kinetic, fall, mass), _ = reduced(world.comm, sums, ())
     if kinetic >= SLOW * fall:  # so a bed that is stirred pays for two sums
         return np.inf
@@ -108,13 +103,18 @@ def _kinetic_part(world: World, system: ContactSystem) -> float:
 
 
 @loop
-def falling_energy(mass: Floats, before: Floats, after: Floats) -> float:
-    """The kinetic energy [J] of the change of the linear velocities of n bodies, from `before` (n, 6) to `after`."""
-    energy = 0.0
+def energies_of_fall(
+    turn: Floats, velocity: Floats, mass: Floats, inertia: Floats, free: Floats
+) -> tuple[float, float, float]:
+    """Of the n bodies of finite mass the kinetic energy [J], that of the changes of their linear velocities to those of
+    a `free` motion (n or more, 6) [J], and their mass [kg]."""
+    kinetic, fall, total = 0.0, 0.0, 0.0
     for n in range(len(mass)):
-        for k in range(3):
-            energy += 0.5 * mass[n] * (after[n, k] - before[n, k]) ** 2
-    return energy
+        if np.isfinite(mass[n]):
+            kinetic, total = add_kinetic(kinetic, turn[n], velocity[n], mass[n], inertia[n]), total + mass[n]
+            for k in range(3):
+                fall += 0.5 * mass[n] * (free[n, k] - velocity[n, k]) ** 2
+    return kinetic, fall, total
 
 
 def _tools(world: World, system: ContactSystem) -> Floats:

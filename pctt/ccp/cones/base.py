@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.arrays import Array
+from pctt.arrays import Array, all_from
 from pctt.ccp.cones.lorentz import LorentzForm, joined, rows, step_inside
 
 
@@ -48,7 +49,7 @@ class Cones(ABC):
         for name, values in self.named():
             if np.shape(values) != (self.count,):
                 return f"{name} has the shape {np.shape(values)}; allowed is {(self.count,)}, one for each contact"
-            if not np.isfinite(values).all() or np.min(values, initial=0.0) < 0.0:
+            if not all_from(values, 0.0):
                 bad = np.flatnonzero(~(np.isfinite(values) & (np.asarray(values) >= 0.0)))
                 return f"{name} is {values[bad[0]]} at contact {bad[0]}; allowed are finite numbers >= 0"
         return ""
@@ -128,8 +129,8 @@ class Cones(ABC):
     @abstractmethod
     def errors(
         self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None
-    ) -> tuple[Array, float]:
-        """||`move`||^2, |g|^2, closing work, opening work and 1/2 g.(y - r) of this rank's contacts (5,), and the
+    ) -> tuple[Sequence[float], float]:
+        """||`move`||^2, |g|^2, closing work, opening work and 1/2 g.(y - r) of this rank's contacts, and the
         greatest speed at which one closes. ``units`` (2, rows, 3) multiply g and y."""
 
     def active(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
