@@ -14,10 +14,10 @@ TINY = float(np.finfo(float).tiny)  #: the least positive number with all digits
 @loop
 def all_from(x: Array, least: float) -> bool:
     """Whether all numbers (n,) are finite, and not below the least."""
+    wrong = 0
     for k in range(len(x)):
-        if not (np.isfinite(x[k]) and x[k] >= least):
-            return False
-    return True
+        wrong += not (np.isfinite(x[k]) and x[k] >= least)
+    return wrong == 0
 
 
 def tangential(x: Array) -> Array:

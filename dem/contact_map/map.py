@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -322,7 +321,9 @@ class ContactMap:
         frame = np.empty((self.rows, 9), precision)
         loops.scale_frames(self.source.frame, size, frame)
         mass = self.mass.rounded(precision)
-        other = ContactMap(self.comm, replace(self.source, frame=frame), self.halo, self.body, precision, mass)
+        given = self.source
+        rows = CompactRows(frame, given.arm, given.body, given.root, given.columns)
+        other = ContactMap(self.comm, rows, self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
         if threads() > 1:
             other._ends = self._ends

@@ -40,6 +40,8 @@ class InverseMass:
 
     def rounded(self: Mass, precision: type[np.floating]) -> Mass:
         """The same in this precision."""
+        if precision is self.precision:
+            return self
         other = copy.copy(self)
         tables = (np.ascontiguousarray(x, dtype=precision) for x in (self.root, self.square, self.unshared))
         other.precision, (other.root, other.square, other.unshared) = precision, tables

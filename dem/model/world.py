@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -70,7 +69,8 @@ class World:
 
     def trial(self) -> World:
         """A world that a step may change: this one stays as it is until it takes its state."""
-        other = copy(self)
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
         other.grains, other.large = self.grains.copy(), self.large.copy()
         return other
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -335,6 +336,10 @@ class ConeProblem:
         """Over all ranks, of a number or an array."""
         return self._reduced(x, MPI.SUM)
 
+    def sums(self, *parts: float) -> Sequence[float]:
+        """Of numbers over all ranks, in one reduction."""
+        return parts if self.comm.size == 1 else self._reduced(np.array(parts, dtype=float), MPI.SUM).tolist()
+
     def min(self, x: float) -> float:
         return self._reduced(x, MPI.MIN)
 
@@ -398,7 +403,7 @@ def _rows_with(blocks: Array, compliance: Array) -> tuple[int, int]:
         answers = False
         for k in range(3):
             gives = gives or compliance[c, k] > 0.0
-            answers = answers or not blocks[c, k, k] + compliance[c, k] == 0.0
+            answers = answers or blocks[c, k, k] + compliance[c, k] != 0.0
         soft, unanswered = soft + gives, unanswered + (not answers)
     return soft, unanswered
 
