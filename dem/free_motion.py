@@ -4,8 +4,8 @@ The velocities of a step are those of its middle. Impulses act at its start. A b
 angular momentum L(w) = exp(dt/2 w) I w in the middle of the step, with the inertia I of its start, and impulses J of
 contacts, joints, springs and loads are to give L(w) = L_old + J. The cone problem needs velocities that are linear in
 the impulses: they are so about the spin that the impulses of the last step would lead to (`free_spin`). What they miss
-of the angular momentum is of third order in dt where forces change smoothly, and `kept_spin` gives it back at the end
-of the step: no impulse is lost.
+of the angular momentum is of third order in dt where forces change smoothly, and `kept_velocities` gives it back at the
+end of the step: no impulse is lost.
 """
 
 from __future__ import annotations
@@ -129,20 +129,22 @@ def _spin_one(turn, spin, moments, dt, change, out, middle):
 
 
 @loop
-def kept_spin(turn: Floats, spin: Floats, middle: Floats, moments: Floats, dt: float) -> Floats:
-    """The angular velocities (n, 3) [rad/s] with which bodies go into the next step, where they have turned with `spin`
-    (n, 3) in one of dt [s] about which their velocities were linear at `middle` (n, 3), see `free_spin`.
+def kept_velocities(turn: Floats, velocity: Floats, middle: Floats, moments: Floats, dt: float) -> Floats:
+    """The velocities (n, 6) with which bodies go into the next step, where they have moved with `velocity` (n, 6) in
+    one of dt [s], and their angular velocities were linear about `middle` (n, 3), see `free_spin`; NaN: the same.
+    Orientations and moments may be those of more bodies.
 
-    The momentum in the middle of the step is L(middle) + I (spin - middle), and that of the angular velocity w in the
-    orientation of the end is exp(-dt/2 w) I w, the same where spin is middle. Newton's method finds w.
+    With the spin of the step the momentum in its middle is L(middle) + I (spin - middle), and that of the angular
+    velocity w in the orientation of the end is exp(-dt/2 w) I w, the same where spin is middle. Newton's method finds
+    w.
     """
-    out = spin.copy()
+    out = velocity.copy()
     half = 0.5 * dt
-    for n in range(len(spin)):
+    for n in range(len(velocity)):
         if np.isnan(middle[n, 0]):
             continue
         frame, twice = (turn[n, 1], turn[n, 2], turn[n, 3]), 2.0 * turn[n, 0]
-        w = turned((spin[n, 0], spin[n, 1], spin[n, 2]), frame, -twice, 2.0)
+        w = turned((velocity[n, 3], velocity[n, 4], velocity[n, 5]), frame, -twice, 2.0)
         x = turned((middle[n, 0], middle[n, 1], middle[n, 2]), frame, -twice, 2.0)
         inertia = _shape_of(moments[n])
         rotation = plus(_ZERO, half, x)
@@ -155,7 +157,7 @@ def kept_spin(turn: Floats, spin: Floats, middle: Floats, moments: Floats, dt: f
         if found:
             new = turned(turned(new, rotation, sine, versed), frame, twice, 2.0)
             for k in range(3):
-                out[n, k] = new[k]
+                out[n, 3 + k] = new[k]
     return out
 
 

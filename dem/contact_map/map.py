@@ -94,10 +94,8 @@ class ContactMap:
         """y += G G' g; y (nc, 3) is C-contiguous."""
         y = shaped("velocities of contacts", y, self.rows, 3)
         self._collect(g, self._m)
-        shared = self._share(self._m)
         loops.scale(self.mass.unshared, self._m, self._w)
-        self._send(shared)
-        self._set_velocities(y, y, self.mass.rates(shared))
+        self._set_velocities(y, y, self._send(self._share(self._m)))
         self.log_flops(2 * self._flops)
 
     def shared(self, g: Floats) -> Floats:
@@ -140,17 +138,16 @@ class ContactMap:
 
     def find_image(self, x: Floats, image: Floats) -> None:
         """image = D x for impulses x (nc, 3)."""
-        count = self.halo.rows
+        count, mass = self.halo.rows, self.mass
         self._push(x, image[:count])
-        self.mass.share(image[:count], self._pushed, image[count:])
+        if mass.shared:
+            mass.share(image[:count], self._pushed, image[count:])
         self.log_flops(self._flops)
 
     def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats) -> None:
         """y = before + G G' z (nc, 3) for the z whose image is image + beta (image - last)."""
-        shared = self._shared_at(image, last, beta)
         loops.scale_extrapolated(self.mass.unshared, image, last, beta, self._w)
-        self._send(shared)
-        self._set_velocities(before, y, self.mass.rates(shared))
+        self._set_velocities(before, y, self._send(self._shared_at(image, last, beta)))
         self.log_flops(self._flops + 12 * self.columns)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
@@ -232,10 +229,13 @@ class ContactMap:
         self.mass.share(m, self._pushed, shared)
         return shared
 
-    def _send(self, shared: Floats) -> None:
-        """Add the velocities by shared coordinates to those of the own bodies, and begin to send them as `_enter`."""
-        self.mass.add_bodies(shared, self._w)
+    def _send(self, shared: Floats) -> Floats:
+        """Add the velocities by shared coordinates to those of the own bodies, and begin to send them as `_enter`;
+        returns the rates (axes,) of a cell."""
+        if len(shared):
+            self.mass.add_bodies(shared, self._w)
         self.halo.begin_update(self._w)
+        return self.mass.rates(shared)
 
     def _set_velocities(self, before: Floats, y: Floats, rate: Floats) -> None:
         """y = before + D' w (nc, 3), with the velocities w that are on their way, and the rates of a cell."""

@@ -151,14 +151,6 @@ def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float, 
 
 
 @loop
-def subtract_held_impulses(r: Floats, compliance: Floats, held: Floats) -> None:
-    """Take from r (nc, 3) what tangential springs give that held these impulses (nc, 2) before the step."""
-    for c in range(len(r)):
-        for k in range(2):
-            r[c, 1 + k] -= compliance[c, 1] * held[c, k]
-
-
-@loop
 def held_after(stiffness: Floats, compliance: Floats, dt: float, held: Floats, impulse: Floats) -> Floats:
     """The impulses (nc or more, 3) of a step, with what tangential springs hold after it in the place of the tangential
     ones of the first nc: all of these in rigid contacts, and nothing in those that bounce, whose C is zero."""

@@ -25,12 +25,12 @@ from mpi4py import MPI
 from dem import bodies
 from dem.arrays import Floats, Keys, places
 from dem.bodies import Bodies
-from dem.compiled import loop
+from dem.compiled import inlined, loop
 from dem.contact_map import CompactRows, ContactMap, Halo
-from dem.contact_map.loops import closing, scale
+from dem.contact_map.loops import closing, scaled_row
 from dem.contact_map.mass import CellMass, ConstrainedMass
 from dem.contact_map.rows import UPPER
-from dem.free_motion import kept_spin
+from dem.free_motion import kept_velocities
 from dem.model.world import World
 from dem.parts.laws import Solved
 from dem.start import stiffness
@@ -154,10 +154,8 @@ class ContactSystem:
             impacts = impacts | strikes
         if smooth:
             self.mu = np.where(impacts, 0.0, self.mu)
-        if contacts.swing is not None:  # impacts last no step
-            self.b[:, 1:] += np.where(impacts[:, None], 0.0, np.einsum("cij,cj->ci", self.frame[:, 1:], contacts.swing))
-        self.r = _beyond(self.b, freely, rounding)
-        stiffness.subtract_held_impulses(self.r, self.compliance, self.held)
+        swing = np.zeros((0, 3)) if contacts.swing is None else contacts.swing
+        self.r = _beyond(self.b, freely, rounding, self.frame, swing, impacts, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
 
@@ -171,13 +169,12 @@ class ContactSystem:
         if push is None and world.turns_unlike_spheres:
             push = self.contact_map.momenta(self.net(last))
         if push is not None:
-            change = np.empty(push.shape)
-            scale(self.contact_map.source.root, push, change)
-            struck = self.dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
-            push[struck], change[struck] = 0.0, 0.0
+            change = _expected(self.contact_map.source.root, push, self.dt)
         coupling = motion.coupling
         if coupling is None:
             coupling = coupling_of(world, motion.applied, motion.motion_velocities, self.dt, push)
+        if push is motion.push and coupling is motion.coupling:
+            return motion, change
         return replace(motion, push=push, coupling=coupling), change
 
     def _free(self, world: World, change: Floats | None) -> tuple[Floats, Floats, Floats]:
@@ -290,15 +287,11 @@ class ContactSystem:
 
     def kept(self, velocity: Floats) -> Floats | None:
         """The velocities (owned, 6) with which bodies go into the next step, where those of this one are `velocity`:
-        others of bodies that are no spheres, see `dem.free_motion.kept_spin`; None: the same."""
+        others of bodies that are no spheres, see `dem.free_motion.kept_velocities`; None: the same."""
         if self.middle is None:
             return None
-        own = self.near.bodies.take(slice(len(velocity)))
-        out = velocity.copy()
-        rows = np.isfinite(self.middle[:, 0]).nonzero()[0]
-        spins = velocity[rows, 3:], self.middle[rows]
-        out[rows, 3:] = kept_spin(own.quaternion[rows], *spins, own.inertia[rows], self.dt)
-        return out
+        table = self.near.bodies
+        return kept_velocities(table.quaternion, velocity, self.middle, table.inertia, self.dt)
 
     def set_rate(self, world: World, momentum: Floats) -> None:
         """Give a cell that deforms the rate of its periods in this step, for the momenta of `velocity_with`;
@@ -360,15 +353,17 @@ class ContactSystem:
 
 def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> ContactMap:
     """The map of contacts with these frames (nc, 3, 3), of bodies that nothing couples beside them; collective."""
-    near, owned, moves = contacts.near, world.owned, bodies.is_dynamic(contacts.near.bodies)
+    near, owned, table = contacts.near, world.owned, contacts.near.bodies
+    moved = np.zeros((0, 3)) if contacts.moved is None else contacts.moved
     # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
-    row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
-    arm = contact_arms(contacts, near.bodies.position, row)
+    row, body, touched, arm = _rows_of(
+        contacts.a, contacts.b, contacts.body, table.mass, owned, contacts.point, moved, table.position
+    )
     rows = CompactRows(frame.reshape(-1, 9), arm, body, inverse_root_masses(world, drives), owned)
     ghosts = touched.nonzero()[0]
     index = near.index[ghosts]
     owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
-    halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
+    halo = Halo(world.comm, owned, len(table), ghosts, owner, index - world.slabs[owner])
     return ContactMap(world.comm, rows, halo, row)
 
 
@@ -391,10 +386,24 @@ def inverse_root_masses(world: World, drives: Drives) -> Floats:
         parts = [_inverse_roots(table.mass, table.inertia) for table in tables]
         return np.concatenate(parts) if last else parts[0]
     out = np.concatenate([_inverse_roots_turned(table.mass, table.inertia, table.quaternion) for table in tables])
-    if last:
+    if last and bodies.is_dynamic(world.large).any():
         guided = free_directions(world.large_bodies) / np.sqrt(tables[1].mass)[:, None, None]
         out[len(world.grains) :, :6] = guided.reshape(-1, 9)[:, UPPER]
     return out
+
+
+@loop
+def _expected(root: Floats, push: Floats, dt: float) -> Floats:
+    """What mass-scaled momenta (n, 6) change of the velocities (n, 6). Of bodies that were struck both become zero."""
+    change = np.empty(push.shape)
+    for n in range(len(push)):
+        p = push[n]
+        new = scaled_row(root, n, p[0], p[1], p[2], p[3], p[4], p[5])
+        struck = dt * max(abs(new[3]), abs(new[4]), abs(new[5])) > STRUCK
+        for k in range(6):
+            change[n, k] = 0.0 if struck else new[k]
+            push[n, k] = 0.0 if struck else push[n, k]
+    return change
 
 
 @loop
@@ -474,35 +483,51 @@ def contact_arms(contacts: Contacts, position: Floats, row: np.ndarray) -> Float
 def _arms(point: Floats, moved: Floats, position: Floats, row: np.ndarray) -> Floats:
     out = np.empty((len(row), 6))
     for c in range(len(row)):
-        for k in range(3):
-            out[c, k] = point[c, k] - position[row[c, 0], k]
-            out[c, 3 + k] = point[c, k] - position[row[c, 1], k]
-            if len(moved):
-                out[c, 3 + k] -= moved[c, k]
+        _set_arm(c, point, moved, position, row, out)
     return out
 
 
+@inlined
+def _set_arm(c, point, moved, position, row, out):
+    for k in range(3):
+        out[c, k] = point[c, k] - position[row[c, 0], k]
+        out[c, 3 + k] = point[c, k] - position[row[c, 1], k]
+        if len(moved):
+            out[c, 3 + k] -= moved[c, k]
+
+
 @loop
-def _beyond(b: Floats, freely: Floats, rounding: Floats) -> Floats:
-    """b + freely (nc, 3), zero where it is not beyond the `rounding` (nc,)."""
+def _beyond(b, freely, rounding, frame, swing, impacts, compliance, held):
+    """b + freely (nc, 3), zero where it is not beyond the `rounding` (nc,), less what tangential springs give that held
+    the impulses `held` (nc, 2) before the step. First b gets the `swing` (nc, 3) along the surfaces, if there is any,
+    where there are no `impacts` (nc,), which last no step."""
     out = np.empty((len(rounding), 3))
     for c in range(len(rounding)):
+        if len(swing) and not impacts[c]:
+            for k in range(1, 3):
+                f, s = frame[c, k], swing[c]
+                b[c, k] += f[0] * s[0] + f[2] * s[2] + f[1] * s[1]
         for k in range(3):
             speed = b[c, k] + freely[c, k]
             out[c, k] = 0.0 if abs(speed) <= rounding[c] else speed
+        for k in range(2):
+            out[c, 1 + k] -= compliance[c, 1] * held[c, k]
     return out
 
 
 @loop
-def _rows_of(a, b, body, moves, owned):
+def _rows_of(a, b, body, mass, owned, point, moved, position):
     """Of contacts of bodies in the rows a and b (nc,): the rows (nc, 2), the indices `body` (nc, 2) of those that move,
-    else -1, and which rows that this rank does not own they touch and move."""
-    row, moved = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64)
-    touched = np.zeros(len(moves), np.bool_)
+    else -1, which rows that this rank does not own they touch and move, and the arms of `contact_arms`."""
+    row, moving = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64)
+    touched, arm = np.zeros(len(mass), np.bool_), np.empty((len(a), 6))
     for c in range(len(a)):
         row[c, 0], row[c, 1] = a[c], b[c]
-        for k, n in enumerate((a[c], b[c])):
-            moved[c, k] = body[c, k] if moves[n] else -1
-            if n >= owned and moves[n]:
+        for k in range(2):
+            n = row[c, k]
+            moves = np.isfinite(mass[n])
+            moving[c, k] = body[c, k] if moves else -1
+            if n >= owned and moves:
                 touched[n] = True
-    return row, moved, touched
+        _set_arm(c, point, moved, position, row, arm)
+    return row, moving, touched, arm
