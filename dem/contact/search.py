@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,6 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Bools, Floats, Ints, Keys, places
 from dem.bodies import CAPSULE, CLUMP, FORM, MESH, POLYHEDRON, SPHERE
-from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.ahead import Course
 from dem.contact.candidates import Pairs, meeting
@@ -113,7 +113,8 @@ def find_contacts(
     lower global index. `lists`: those of an earlier search that may hold; None: those of the world. With `besides`,
     contacts that a search with margins not greater has found, only those are found that are not among them.
     """
-    not_negative("contact distance delta", delta)
+    if not 0.0 <= delta < math.inf:
+        raise ValueError(f"contact distance delta must not be negative, got {delta:g}")
     margin, travel, shifts = _margins(world, delta, free, margin, shifts)
     refuse_short(world, margin)
     lists = grain_lists(world, world.lists if lists is None else lists, margin, travel)

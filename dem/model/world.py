@@ -11,7 +11,7 @@ from mpi4py import MPI
 from dem import bodies
 from dem.arrays import Floats, Ints, Keys
 from dem.bodies import Bodies
-from dem.motion import Dynamic, Pose, checked_pose
+from dem.motion import Dynamic, Pose
 from dem.parts.cell import OPEN, Cell
 from dem.parts.contact_law import ContactLaw
 from dem.parts.passages import Passages
@@ -21,7 +21,8 @@ from dem.together import together
 
 #: The fields of a world that a step changes; what these refer to is replaced, and never changed in place.
 STATE = (
-    "grains", "large", "slabs", "only_spheres", "lists", "memory", "cell", "passages", "time", "step", "spare",
+    "grains", "large", "slabs", "only_spheres", "any_spheres", "lists", "memory", "cell", "passages", "time", "step",
+    "spare",
 )  # fmt: skip
 
 
@@ -55,6 +56,7 @@ class World:
     spare: float = 3000.0  #: iterations that steps at rest may spend beyond the limits of the solver, `pctt.run.rest`
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
+    any_spheres: bool = field(init=False)  #: whether any is one
 
     #: Kinds and names of the parts and large bodies that a run has changed by `dem.model.changes.change`.
     changed: set[tuple[str, str]] = field(init=False, default_factory=set)
@@ -90,10 +92,10 @@ class World:
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
         self.grains, self.lists = grains, None
-        everyone = np.zeros((self.comm.size + 1, 2), np.int64)
-        self.comm.Allgather(np.array([len(grains), (grains.shape != bodies.SPHERE).any()], np.int64), everyone[1:])
+        everyone, balls = np.zeros((self.comm.size + 1, 2), np.int64), np.count_nonzero(grains.shape == bodies.SPHERE)
+        self.comm.Allgather(np.array([len(grains), balls], np.int64), everyone[1:])
         self.slabs = np.cumsum(everyone[:, 0])
-        self.only_spheres = not everyone[:, 1].any()
+        self.only_spheres, self.any_spheres = bool((everyone[:, 0] == everyone[:, 1]).all()), bool(everyone[:, 1].any())
 
     @property
     def ids(self) -> int:
@@ -140,7 +142,7 @@ class World:
         """Places (3,) and quaternions (4,) of the large bodies of prescribed motion at `time` [s], by row; collective.
         SceneError if a motion fails."""
         return together(self.comm, "motion of a large body", lambda: {
-            row: checked_pose(body.motion, time, body.position, body.quaternion)
+            row: body.pose(time)
             for row, body in enumerate(self.large_bodies) if not isinstance(body.motion, Dynamic)
         })  # fmt: skip
 

@@ -329,8 +329,8 @@ def contact_statistics(step: Step) -> dict[str, float]:
     """
     comm, contacts, impulse = step.world.comm, step.contacts, step.in_cone
     grains, before = step.world.grains, contacts.near.bodies
-    sums = exchanged(grains.mass, before.velocity, grains.velocity, impulse)
-    (count, weight, push, size), _ = reduced(comm, (len(contacts), *sums), ())
+    of_all = len(contacts), *exchanged(grains.mass, before.velocity, grains.velocity, impulse)
+    (count, weight, push, size), _ = reduced(comm, of_all, ())
     least = 0.01 * weight / max(count, 1.0)
     *sums, worst = counted(impulse, step.system.friction, contacts.gap, contacts.a, contacts.b, before.shape, least)
     sums, (worst,) = reduced(comm, [*sums, step.system.at_once], (max(worst, contacts.held_overlap),))

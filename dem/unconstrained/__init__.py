@@ -6,6 +6,7 @@ the record take what they need from it. Nothing else of a step asks motions and 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -14,7 +15,6 @@ import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats, Ints
-from dem.checks import positive
 from dem.free_motion import falling, free_velocity, spin_freely, velocity_changes
 from dem.model.neighbourhood import Neighbourhood
 from dem.model.world import World
@@ -52,7 +52,8 @@ class UnconstrainedMotion:
 def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
     """Return the motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a part
     fails."""
-    positive("time step", dt)
+    if not 0.0 < dt < math.inf:
+        raise ValueError(f"time step must be positive, got {dt:g}")
     poses = world.poses(world.time + dt)
     motion_velocities, moves = velocities_of_motions(world, poses, dt), bodies.is_dynamic(world.large)
     prescribed = np.where(moves[:, None], world.large.velocity, motion_velocities)

@@ -66,6 +66,8 @@ def figures(problem: ConeProblem, g: Array, rigid: Array) -> Accuracy:
     """Those of an impulse g (nc, 3) in the cones, whose velocities are ``rigid`` without compliance and r."""
     step = 1.0 / problem.mean_diagonal
     soft = problem.compliance[: None if problem.yields else 0]
+    sums: Sequence[float]
+    greatest: Sequence[float]
     if type(problem.cones) is FrictionCones:
         sums, greatest = _judged(g, rigid, soft, problem.r, problem.mu, step)
     else:

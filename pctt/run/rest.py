@@ -90,11 +90,9 @@ def _kinetic_part(world: World, system: ContactSystem) -> float:
     """The kinetic energy of the bodies over that which a step of free motion would give them; inf where a tool, a belt
     or a flow passes them faster than that. Collective."""
     grains, large = world.grains, world.large
-    sums = energies_of_fall(grains.quaternion, grains.velocity, grains.mass, grains.inertia, system.free_velocity)
-    if world.comm.rank == 0:  # all ranks know the large bodies, and processors may round otherwise
-        of_large = energies_of_fall(large.quaternion, large.velocity, large.mass, large.inertia, system.free_large)
-        sums = [one + other for one, other in zip(sums, of_large)]
-    (kinetic, fall, mass), _ = reduced(world.comm, sums, ())
+    own = [(grains, system.free_velocity), (large, system.free_large)][: 1 if world.comm.rank else 2]  # as in a record
+    each = [energies_of_fall(of.quaternion, of.velocity, of.mass, of.inertia, free) for of, free in own]
+    (kinetic, fall, mass), _ = reduced(world.comm, [*map(sum, zip(*each))], ())
     if kinetic >= SLOW * fall:  # so a bed that is stirred pays for two sums
         return np.inf
     _, (fastest,) = reduced(world.comm, (), (_passing(system, _tools(world, system)).max(initial=0.0),))

@@ -66,6 +66,7 @@ class Stepper:
         dump: Dump | None = None,
     ):
         self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
+        self._limits = settings.limits
         self._slabs: Ints | None = None  # those of the last step, whose impulses the memory has
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
@@ -154,9 +155,8 @@ class Stepper:
         self, world: World, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, before: ccp.Result | None
     ) -> ccp.Result:
         """The solution of a problem of the step as the settings say, with what that `before` has cost."""
-        settings = self.settings
         with log.phase("solve"):
-            limits = rest.limits_of(settings.limits, world, system)
+            limits = rest.limits_of(self._limits, world, system)
             result = self._by(problem, guess, limits, self.newton)
             rest.account(world, limits, result)
             result = rest.with_islands(world, system, problem, guess, limits, self._by_itself, result)
@@ -180,7 +180,7 @@ class Stepper:
         times a step with those that overlap at its end because bodies turn, by a tenth of delta: and how often now."""
         settings, contacts, free = self.settings, system.contacts, system.motion
         delta, recovery = settings.delta, settings.recovery_speed
-        left = settings.dt * settings.limits.closing_speed  # what a solution may leave of an overlap
+        left = settings.dt * self._limits.closing_speed  # what a solution may leave of an overlap
         deep = max(0.01 * delta, left if left < np.inf else 0.0)
         wider = find_overrun(world, free, contacts, velocity, delta, deep, recovery)
         if wider is not None:

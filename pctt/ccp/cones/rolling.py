@@ -77,7 +77,7 @@ class RollingCones(Cones):
         power = (g * y).sum(axis=1).reshape(2, -1).sum(axis=0)
         closing = np.maximum(-normal, 0.0)
         works = push @ closing, np.maximum(power, 0.0).sum(), 0.5 * np.vdot(g, y - r)
-        sums = move[~(move <= NO_MOVE * speed)].sum(), np.vdot(g, g), *works
+        sums = [float(each) for each in (move[~(move <= NO_MOVE * speed)].sum(), np.vdot(g, g), *works)]
         return sums, float(closing.max(initial=0.0))
 
     def de_saxce(self, y: Array) -> Array:
