@@ -37,10 +37,12 @@ def meeting(
     surfaces, if the bodies move and turn by any of the `shifts` (k, large, 6) [m, rad]."""
     last = world.comm.rank == world.comm.size - 1
     first = near.grains + near.ghosts
-    foreign = bodies.is_dynamic(world.large)[table.row[first:] - first] & (not last)
+    foreign = np.zeros(len(table.row) - first, np.bool_)
+    if not last:
+        foreign = bodies.is_dynamic(world.large)[table.row[first:] - first]
     found = [_of_grains(near, lists.own, ~foreign, table, delta, shifts, grown)]
     if last:
-        if bodies.is_dynamic(world.large).any():
+        if world.large_moves:
             found.append(_of_large(world, near, table, delta, shifts))
     else:
         found.append(_of_grains(near, lists.away, foreign, table, delta, shifts, grown))

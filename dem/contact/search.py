@@ -152,7 +152,7 @@ def _margins(
 def _that_touch(world: World, near: Neighbourhood, table: Primitives, pairs: Pairs) -> Pairs:
     """The pairs of materials that touch each other, and of bodies that are not `World.apart`."""
     i, j, reach = pairs
-    if not world.pairs.touching.all():
+    if not world.pairs.all_touch:
         material = near.bodies.material[table.row]
         touch = world.pairs.touching[material[i], material[j]] > 0.0
         i, j, reach = i[touch], j[touch], reach[touch]
@@ -302,9 +302,9 @@ def _order(foreign, a, b, key):
 def exceeds_margin(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
     """Return whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as
     in one of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
-    free = bodies.is_dynamic(world.large)
-    if not free.any():
+    if not world.large_moves:
         return False
+    free = bodies.is_dynamic(world.large)
     size = extents([body.shapes for body in world.large_bodies])[free]
 
     def distance(shift: Floats) -> Floats:
@@ -347,10 +347,12 @@ def _without_rigid(world: World, contacts: Contacts) -> Contacts:
 
     Their normals are across the free directions of a body, and they do not turn it about a free axis, and the other
     body is held too. Their normal impulse changes no velocity, and would allow any friction."""
+    if not world.large_moves:
+        return contacts
     near, moves = contacts.near, bodies.is_dynamic(world.large)[:, None, None]
     first = near.grains + near.ghosts
     rigid = np.minimum(contacts.a, contacts.b) >= first
-    if not (moves.any() and rigid.any()):
+    if not rigid.any():
         return contacts
     these = contacts.take(rigid)
     free, turns = free_directions(world.large_bodies) * moves, free_turns(world.large_bodies) * moves

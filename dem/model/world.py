@@ -118,7 +118,12 @@ class World:
     @property
     def turns_unlike_spheres(self) -> bool:
         """Whether a body that turns freely may do so in another way than a sphere; the same on all ranks."""
-        return not self.only_spheres or bool(np.isfinite(self.large.inertia).all(axis=1).any())
+        return not self.only_spheres or (self.large_moves and bool(np.isfinite(self.large.inertia).all(axis=1).any()))
+
+    @property
+    def large_moves(self) -> bool:
+        """Whether forces move any large body."""
+        return any(isinstance(body.motion, Dynamic) for body in self.large_bodies)
 
     def large_row(self, name: str) -> int:
         """Row of a large body in `large`; KeyError if there is none of that name."""

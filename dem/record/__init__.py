@@ -334,7 +334,7 @@ def contact_statistics(step: Step) -> dict[str, float]:
     least = 0.01 * weight / max(count, 1.0)
     *sums, worst = counted(impulse, step.system.friction, contacts.gap, contacts.a, contacts.b, before.shape, least)
     sums, (worst,) = reduced(comm, [*sums, step.system.at_once], (max(worst, contacts.held_overlap),))
-    bounces = {"impacts_at_once": sums[3]} if step.world.pairs.restitution.any() else {}
+    bounces = {"impacts_at_once": sums[3]} if step.world.pairs.bounces else {}
     return {
         "contacts": count,
         "active_contacts": sums[0],

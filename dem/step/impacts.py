@@ -67,7 +67,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     ball = table.shape == SPHERE
     ball[grains:] = False
     ball[slots(world, table.id)[0]] = False
-    if pairs.restitution.any():
+    if pairs.bounces:
         old = old.copy()
         old[grains:] = motion.prescribed
     image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])

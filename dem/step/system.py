@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies
 from dem.arrays import Floats, Keys, places
 from dem.bodies import Bodies
 from dem.compiled import inlined, loop
@@ -145,7 +144,7 @@ class ContactSystem:
             self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
         self.at_once, self._freely = 0, freely
         self._bounces, self._part = np.zeros(len(contacts), np.bool_), np.ones(len(contacts))
-        if world.pairs.restitution.any():
+        if world.pairs.bounces:
             self._bounce(world, contacts, freely[:, 0], eased)
         impacts = self._bounces
         if contacts.parting is not None:
@@ -228,7 +227,7 @@ class ContactSystem:
         work, where all contacts together, with these impulses (parts nc, 3) and momenta, make energy. Newton's law of
         impacts may do so with friction (Kane and Levinson 1985), and does not at e = 0. None if they make none, or if
         no part is left; collective."""
-        if not world.pairs.restitution.any():
+        if not world.pairs.bounces:
             return None
         parts = 1 if self.resistance is None else 2
         g = impulse.reshape(parts, len(self.key), 3)
@@ -347,6 +346,8 @@ class ContactSystem:
     def drive_impulse(self, large: Floats) -> Floats:
         """Impulses and angular impulses (large, 6) of the drives of large bodies, and of parts on them, that have the
         velocities `large` (large, 6) after the step."""
+        if not self.drives.servo_inertia.any():
+            return self.drives.impulse
         line, slip = self.drives.line, self.free_large - large
         return self.drives.impulse + (self.drives.servo_inertia * np.einsum("bi,bi->b", line, slip))[:, None] * line
 
@@ -382,11 +383,11 @@ def inverse_root_masses(world: World, drives: Drives) -> Floats:
     on all ranks, else (owned, 12)."""
     last = world.comm.rank == world.comm.size - 1
     tables = [world.grains, with_servos(world.large, drives)] if last else [world.grains]
-    if world.only_spheres and not bodies.is_dynamic(world.large).any():
+    if world.only_spheres and not world.large_moves:
         parts = [_inverse_roots(table.mass, table.inertia) for table in tables]
         return np.concatenate(parts) if last else parts[0]
     out = np.concatenate([_inverse_roots_turned(table.mass, table.inertia, table.quaternion) for table in tables])
-    if last and bodies.is_dynamic(world.large).any():
+    if last and world.large_moves:
         guided = free_directions(world.large_bodies) / np.sqrt(tables[1].mass)[:, None, None]
         out[len(world.grains) :, :6] = guided.reshape(-1, 9)[:, UPPER]
     return out

@@ -55,8 +55,10 @@ def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
     if not 0.0 < dt < math.inf:
         raise ValueError(f"time step must be positive, got {dt:g}")
     poses = world.poses(world.time + dt)
-    motion_velocities, moves = velocities_of_motions(world, poses, dt), bodies.is_dynamic(world.large)
-    prescribed = np.where(moves[:, None], world.large.velocity, motion_velocities)
+    prescribed = motion_velocities = velocities_of_motions(world, poses, dt)
+    if world.large_moves:
+        moves = bodies.is_dynamic(world.large)[:, None]
+        prescribed = np.where(moves, world.large.velocity, motion_velocities)
     applied, grains = applied_impulses(world, dt, motion_velocities), free_velocity(world.grains, world.gravity, dt)
     if applied is not None:
         grains += velocity_changes(world.grains, applied.grains)
@@ -67,13 +69,13 @@ def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
 def _drives(world: World, dt: float, motion_velocities: Floats, applied: Applied | None, saturated: Ints) -> Drives:
     pushed = None if applied is None else applied.large
     call = partial(drives_of, world, dt, motion_velocities, pushed, saturated)
-    return together(world.comm, "motion of a large body", call) if bodies.is_dynamic(world.large).any() else call()
+    return together(world.comm, "motion of a large body", call) if world.large_moves else call()
 
 
 def large_velocity(world: World, free: UnconstrainedMotion, velocity: Floats) -> Floats:
     """Those (large, 6) of the large bodies, on all ranks, of the velocities (owned, 6) over the step of the bodies
     whose rows each rank owns; collective."""
-    if not bodies.is_dynamic(world.large).any():
+    if not world.large_moves:
         return free.prescribed
     large = np.zeros(world.large.velocity.shape)
     count = len(world.grains)

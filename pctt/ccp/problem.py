@@ -217,7 +217,9 @@ class ConeProblem:
         natural = 0.0 if moved == 0.0 else math.sqrt(moved) / math.sqrt(whole) if whole > 0.0 else math.inf
         most = closing if closing > opening or math.isnan(closing) else opening  # impulses may be no numbers
         work = 0.0 if energy <= 0.0 else most / energy
-        return Errors(_number(natural), _number(work), _number(speed))
+        if math.isnan(natural + work + speed):
+            return Errors(*map(_number, (natural, work, speed)))
+        return Errors(natural, work, speed)
 
     def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
         """That of the `errors`."""

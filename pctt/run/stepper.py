@@ -197,8 +197,10 @@ class Stepper:
         self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result
     ) -> dict[str, Any]:
         """The entries of the figures for the files of the problem, if it is written."""
+        if self.dump is None:
+            return {}
         with log.phase("output"):
-            return self.dump.step(system, problem, guess, result, result.asked or result) if self.dump else {}
+            return self.dump.step(system, problem, guess, result, result.asked or result)
 
     def _figures(self, world: World, contacts: int, result: ccp.Result, files: dict[str, Any]) -> dict[str, Any]:
         """The line of a step in steps.jsonl."""
@@ -241,7 +243,7 @@ def _remembered(world: World, system: ContactSystem, found: ccp.Result) -> Impul
 def _locks(world: World, result: ccp.Result) -> bool:
     """Whether no impulses let bodies bounce as they are to, so that their impacts are to be without friction: in a
     corner it may press a body on one wall as fast as the other sends it off."""
-    return result.status is ccp.Status.UNBOUNDED and bool(world.pairs.restitution.any())
+    return result.status is ccp.Status.UNBOUNDED and world.pairs.bounces
 
 
 def _refuse_squeezed(world: World, result: ccp.Result) -> None:
