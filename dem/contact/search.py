@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -72,7 +73,7 @@ class Contacts:
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row per contact by name, without copies."""
-        left = {"near", "shifts", "owned", "lists", "lag", "held_overlap"}
+        left = {"near", "shifts", "owned", "lists", "lag", "held_overlap", "frame"}
         left |= {name for name in ("moved", "linear", "swing", "drift", "parting") if getattr(self, name) is None}
         return {name: value for name, value in vars(self).items() if name not in left}
 
@@ -80,6 +81,11 @@ class Contacts:
     def linear_gap(self) -> Floats:
         """The gaps (nc,) to which the normal velocities of a step times dt are added [m]."""
         return self.gap if self.linear is None else self.linear
+
+    @cached_property
+    def frame(self) -> Floats:
+        """The `contact_frames` (nc, 3, 3) of the normals."""
+        return contact_frames(self.normal)
 
     def branch(self, position: Floats) -> Floats:
         """From the centre of body a to that of body b, or of its image (nc, 3), at these positions (rows, 3) [m]."""
@@ -97,6 +103,29 @@ class Contacts:
     def take(self, rows: np.ndarray) -> Contacts:
         """The contacts of the given rows (index array or mask)."""
         return replace(self, **{name: column[rows] for name, column in self.columns().items()})
+
+
+def contact_frames(normal: Floats) -> Floats:
+    """Return orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
+
+    Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
+    but where the sign of its z component changes.
+    """
+    return _frames(normal).reshape(-1, 3, 3)
+
+
+@loop
+def _frames(normal: Floats) -> Floats:
+    out = np.empty((len(normal), 9))
+    for c in range(len(normal)):
+        x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
+        sign = np.copysign(1.0, z)
+        p = -1.0 / (sign + z)
+        q = x * y * p
+        out[c, 0], out[c, 1], out[c, 2] = x, y, z
+        out[c, 3], out[c, 4], out[c, 5] = 1.0 + sign * x * x * p, sign * q, -sign * x
+        out[c, 6], out[c, 7], out[c, 8] = q, sign + y * y * p, -y
+    return out
 
 
 def find_contacts(

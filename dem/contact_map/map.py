@@ -58,9 +58,11 @@ class ContactMap:
         self._arrays = self._floats(given.frame), self._floats(given.arm), body
         self._w, self._m = np.zeros((2, halo.rows, 6), precision)
         self._pushed = np.zeros(self.mass.axes)  # by the impulses that were collected last, on this rank
-        ghost = np.zeros(halo.rows, bool)
-        ghost[halo.ghosts] = True
-        self._first_away = first_touching(body, ghost) if len(halo.ghosts) else self.rows
+        self._first_away = self.rows
+        if len(halo.ghosts):
+            ghost = np.zeros(halo.rows, bool)
+            ghost[halo.ghosts] = True
+            self._first_away = first_touching(body, ghost)
         self._set_parts()
         self._flops = 45 * self.rows + 6 * self.columns
 
@@ -129,8 +131,8 @@ class ContactMap:
         self._away = [self._part(self._first_away, self.rows)] if self._first_away < self.rows else []
 
     def _part(self, begin: int, end: int) -> tuple[Any, ...]:
-        here = slice(begin, end)
-        return (here, *(array[here] for array in self._arrays))
+        here, (frame, arm, body) = slice(begin, end), self._arrays
+        return here, frame[here], arm[here], body[here]
 
     def image(self) -> Floats:
         """Memory for an image: momenta (halo.rows, 6), and the shared coordinates (mass.shared, 6)."""

@@ -34,7 +34,8 @@ class InverseMass:
 
     def __init__(self, root: Floats, precision: type[np.floating] = np.float64):
         self.precision = precision
-        self.root, self.square = (np.ascontiguousarray(x, dtype=precision) for x in (root, squared(root)))
+        self.root = np.ascontiguousarray(root, dtype=precision)
+        self.square = np.ascontiguousarray(squared(root), dtype=precision)
         self.unshared = self.square  #: M^-1 of the bodies that are in no shared coordinate, else zero
         self._none = np.zeros(0, precision)
 

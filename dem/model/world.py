@@ -57,6 +57,7 @@ class World:
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
     any_spheres: bool = field(init=False)  #: whether any is one
+    large_moves: bool = field(init=False)  #: whether forces move any large body
 
     #: Kinds and names of the parts and large bodies that a run has changed by `dem.model.changes.change`.
     changed: set[tuple[str, str]] = field(init=False, default_factory=set)
@@ -68,6 +69,11 @@ class World:
 
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
+        self._set_large(self.large_bodies)
+
+    def _set_large(self, large_bodies: tuple[LargeBody, ...]) -> None:
+        self.large_bodies = large_bodies
+        self.large_moves = any(isinstance(body.motion, Dynamic) for body in large_bodies)
 
     def trial(self) -> World:
         """A world that a step may change: this one stays as it is until it takes its state."""
@@ -120,11 +126,6 @@ class World:
         """Whether a body that turns freely may do so in another way than a sphere; the same on all ranks."""
         return not self.only_spheres or (self.large_moves and bool(np.isfinite(self.large.inertia).all(axis=1).any()))
 
-    @property
-    def large_moves(self) -> bool:
-        """Whether forces move any large body."""
-        return any(isinstance(body.motion, Dynamic) for body in self.large_bodies)
-
     def large_row(self, name: str) -> int:
         """Row of a large body in `large`; KeyError if there is none of that name."""
         names = [body.name for body in self.large_bodies]
@@ -140,7 +141,7 @@ class World:
     def replace_large(self, body: LargeBody) -> None:
         """Put this large body in the place of that of its name; the same on all ranks."""
         row = self.large_row(body.name)
-        self.large_bodies = (*self.large_bodies[:row], body, *self.large_bodies[row + 1 :])
+        self._set_large((*self.large_bodies[:row], body, *self.large_bodies[row + 1 :]))
         self.changed.add(("body", body.name))
 
     def poses(self, time: float) -> dict[int, Pose]:

@@ -22,7 +22,7 @@ from dem.measures import Sample
 from dem.model.world import World
 from dem.shapes.forms import arms
 from dem.step.laws import along_normal
-from dem.step.system import ContactSystem, contact_arms, contact_frames, gap_velocities
+from dem.step.system import ContactSystem, contact_arms, gap_velocities
 from dem.together import barrier
 from dem.unconstrained import UnconstrainedMotion, large_velocity
 
@@ -215,7 +215,7 @@ def _opening(world: World, contacts: Contacts, position: Floats, velocity: Float
     """Normal velocities (nc,) of contacts of bodies with these positions and velocities (rows, 3 and 6)."""
     row = np.stack([contacts.a, contacts.b], axis=1).astype(np.uint32)
     arm = contact_arms(contacts, position, row)
-    opening: Floats = relative_velocities(contact_frames(contacts.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
+    opening: Floats = relative_velocities(contacts.frame.reshape(-1, 9), arm, row, velocity)[:, 0]
     flow = contacts.flow(world.cell, position)
     return opening if flow is None else opening + np.einsum("ci,ci->c", contacts.normal, flow)
 

@@ -103,7 +103,7 @@ class ContactSystem:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
         self.dt, self.contacts, self.near, self.drives, self.applied = dt, contacts, near, motion.drives, motion.applied
         self.key, self.point = contacts.key, contacts.point
-        self.frame = contact_frames(contacts.normal)
+        self.frame = contacts.frame
         self.contact_map = _map_of(world, contacts, self.frame, self.drives)
         self.surface = surface_velocities(world, contacts, self.frame)
         self.take_flow(world, contacts)
@@ -448,29 +448,6 @@ def with_servos(large: Bodies, drives: Drives) -> Bodies:
     turns = drives.line[:, 3:].any(axis=1)
     inertia[:, 2] += drives.servo_inertia * turns  # the z axis of a hinged body is that of its hinge
     return replace(large, mass=mass, inertia=inertia)
-
-
-def contact_frames(normal: Floats) -> Floats:
-    """Return orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
-
-    Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
-    but where the sign of its z component changes.
-    """
-    return _frames(normal).reshape(-1, 3, 3)
-
-
-@loop
-def _frames(normal: Floats) -> Floats:
-    out = np.empty((len(normal), 9))
-    for c in range(len(normal)):
-        x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
-        sign = np.copysign(1.0, z)
-        p = -1.0 / (sign + z)
-        q = x * y * p
-        out[c, 0], out[c, 1], out[c, 2] = x, y, z
-        out[c, 3], out[c, 4], out[c, 5] = 1.0 + sign * x * x * p, sign * q, -sign * x
-        out[c, 6], out[c, 7], out[c, 8] = q, sign + y * y * p, -y
-    return out
 
 
 def contact_arms(contacts: Contacts, position: Floats, row: np.ndarray) -> Floats:

@@ -145,7 +145,7 @@ def _by(
         result = Result(nothing, Status.UNBOUNDED, words, cold, 0, solver=name, law=law)
         _measure(problem, result)
         return result
-    limits = dataclasses.replace(limits, max_it=method.iterations) if limits.max_it < 0 else limits
+    limits = limits.but(max_it=method.iterations) if limits.max_it < 0 else limits
     own = newton_for(problem.comm, name) if method.newton and newton is None else None
     systems = newton or own if method.newton else None
     if systems is not None:

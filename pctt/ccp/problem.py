@@ -101,7 +101,7 @@ class ConeProblem:
         self.cones = FrictionCones(self.mu) if cones is None else cones
         self.comm, self.key = comm, key
         self._curvature: list[float] = []  # shared with problems of other r
-        self.point = None if point is None else np.concatenate([point] * self.cones.parts)
+        self.point = point if point is None or self.cones.parts == 1 else np.concatenate([point] * self.cones.parts)
         self.compliance = compliances(compliance, self.cones.count, len(self.r))
         self.operator = self._given_operator = door.operator_of(comm, len(self.r), contacts.width, N, G, masses)
         if self.units is not None:
@@ -372,8 +372,9 @@ class ConeProblem:
 
     def destroy(self) -> None:
         """Free the PETSc objects now."""
-        for operator in {id(each): each for each in (self.operator, self._given_operator)}.values():
-            operator.destroy()
+        self.operator.destroy()
+        if self._given_operator is not self.operator:
+            self._given_operator.destroy()
         if "N" in self.__dict__:
             self.__dict__.pop("N").destroy()
 

@@ -14,7 +14,6 @@ counted (`World.spare`): so many as SPARE, and a SHARE of all iterations, may le
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -51,7 +50,7 @@ def limits_of(limits: Limits, world: World, system: ContactSystem) -> Limits:
 def _aimed(limits: Limits, world: World, part: float) -> Limits:
     """The same limits with an aim, for bodies with this part of the energy of a free fall."""
     spare = ATTEMPT if part < STILL and world.spare >= ATTEMPT else 0
-    return dataclasses.replace(limits, aim=AIM, spare=spare)
+    return limits.but(aim=AIM, spare=spare)
 
 
 def with_islands(

@@ -21,7 +21,7 @@ from dem.step import Step, advance, carried, find_overrun, find_turned
 from dem.step.fast import refuse_passages
 from dem.step.impacts import in_order
 from dem.step.impulses import ImpulseMemory
-from dem.step.system import ContactSystem, contact_frames
+from dem.step.system import ContactSystem
 from dem.together import SceneError
 from dem.unconstrained import unconstrained
 from pctt import ccp, log
@@ -148,7 +148,7 @@ class Stepper:
     def _recalled(self, world: World, contacts: Contacts) -> tuple[Array, Array]:
         """The impulses (parts nc, 3) of the last step of these contacts, and what laws kept of them (nc, columns)."""
         elsewhere = self._slabs is not world.slabs
-        impulse, _, kept = self.memory.recall(contacts.key, contact_frames(contacts.normal), elsewhere)
+        impulse, _, kept = self.memory.recall(contacts.key, contacts.frame, elsewhere)
         return impulse, kept
 
     def _solved(

@@ -25,12 +25,14 @@ class Cones(ABC):
     ----------
     mu : (count,) coefficients of friction
     count : contacts
+    parts : rows of a contact
     tangents : of each part, which numbers of a contact it has
     what : in words, what a problem with them has
     """
 
     mu: Array
     count: int
+    parts: int
     tangents: tuple[tuple[int, ...], ...]
     what: str
 
@@ -38,11 +40,6 @@ class Cones(ABC):
     @abstractmethod
     def coefficients(self) -> Array:
         """Those of the parts (k, count)."""
-
-    @property
-    def parts(self) -> int:
-        """Rows of a contact."""
-        return (1 + sum(map(len, self.tangents))) // 3
 
     def why_refused(self) -> str:
         """What is wrong with the coefficients, in words; else ""."""

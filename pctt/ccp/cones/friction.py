@@ -288,7 +288,7 @@ def project(x: Array, mu: Array, out: Array | None = None) -> Array:
 class FrictionCones(Cones):
     """The cones |g_t| <= mu g_n hold the impulses of contacts with friction ``mu`` (count,)."""
 
-    tangents, what = ((1, 2),), "friction"
+    parts, tangents, what = 1, ((1, 2),), "friction"
 
     def __init__(self, mu: Array):
         self.mu = floats(mu)

@@ -41,7 +41,7 @@ class RollingCones(Cones):
     """The cones hold impulses and moments of contacts with coefficients (count,): ``mu`` of friction, ``rolling`` and
     ``spinning``, of which the last two are lengths over those of the contacts."""
 
-    tangents, what = ((1, 2), (4, 5), (3,)), "rolling or spinning resistance"
+    parts, tangents, what = 2, ((1, 2), (4, 5), (3,)), "rolling or spinning resistance"
 
     def __init__(self, mu: Array, rolling: Array, spinning: Array):
         self.mu, self.rolling, self.spinning = (floats(each) for each in (mu, rolling, spinning))
