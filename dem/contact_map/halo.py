@@ -34,7 +34,7 @@ class Halo:
         """Ghosts in the rows ``ghosts`` (n,) are copies of the rows ``place`` (n,) of the ranks ``owner`` (n,);
         collective."""
         self.comm, self.own, self.rows = comm, own, rows
-        self.ghosts = ghosts[np.argsort(owner, kind="stable")]
+        self.ghosts = ghosts[owner.argsort(kind="stable")]
         asked = exchange(comm, {"row": place, "rank": np.full(len(place), comm.rank)}, owner)
         self._shared = asked["row"]  # own rows that are ghosts elsewhere, by rank
         self._owners, self._holders = _pieces(owner), _pieces(asked["rank"])

@@ -288,9 +288,10 @@ def _constraint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, 
 def _carried(step: Step, prescribed: Bools) -> float:
     """The kinetic energy [J] that bodies have which go with the `prescribed` (large,) motions that they touch, on this
     rank."""
-    velocity = np.where(prescribed[:, None], step.world.large.velocity, 0.0)
+    velocity = step.world.large.velocity
     if not velocity.any():
         return 0.0
+    velocity = np.where(prescribed[:, None], velocity, 0.0)
     near, arm = step.contacts.near, step.system.contact_map.source.arm
     first, mass = near.grains + near.ghosts, near.bodies.mass
     return carried_energy(velocity, first, mass, step.contacts.a, step.contacts.b, arm)

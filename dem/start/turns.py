@@ -73,7 +73,7 @@ class TurnWatch:
         of_grains = turning_of_grains(world.grains, self._held)
         speeds = np.concatenate([of_grains, turning_of_large(world.large, world.large_bodies)])
         ids = np.concatenate([world.grains.id, world.large.id])
-        row = int(np.argmax(speeds)) if len(speeds) else -1
+        row = int(speeds.argmax()) if len(speeds) else -1
         mine = (float(speeds[row]), int(ids[row])) if len(speeds) else (0.0, -1)
         speed, id = greatest(world.comm, mine)
         again = self._times + 1 if self._last in (-1, id) else 1

@@ -143,7 +143,7 @@ class ContactSystem:
         if self.resistance is not None and self.attraction is not None:
             self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
         self.at_once, self._freely = 0, freely
-        self._bounces, self._part = np.zeros(len(contacts), np.bool_), np.ones(len(contacts))
+        self._bounces = np.zeros(len(contacts), np.bool_)
         if world.pairs.bounces:
             self._bounce(world, contacts, freely[:, 0], eased)
         impacts = self._bounces
@@ -214,7 +214,7 @@ class ContactSystem:
         begin = (e > 0.0) & (came < -self.dt * math.hypot(*world.gravity)) & closes
         if contacts.parting is not None:
             begin &= np.isnan(contacts.parting)
-        self.at_once, self._bounces = int(begin.sum()), begin
+        self.at_once, self._bounces, self._part = int(begin.sum()), begin, np.ones(len(contacts))
         if eased is not None:
             place = places(eased[0], self.key)
             self._part[place >= 0] = eased[1][place[place >= 0]]
@@ -363,7 +363,7 @@ def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> 
     rows = CompactRows(frame.reshape(-1, 9), arm, body, inverse_root_masses(world, drives), owned)
     ghosts = touched.nonzero()[0]
     index = near.index[ghosts]
-    owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
+    owner = np.minimum(world.slabs.searchsorted(index, side="right"), world.comm.size) - 1
     halo = Halo(world.comm, owned, len(table), ghosts, owner, index - world.slabs[owner])
     return ContactMap(world.comm, rows, halo, row)
 

@@ -179,9 +179,9 @@ def _wrong_contacts(
         ("key", key, [(nc,)]),
         ("compliance", soft, [(), (nc,), (nc, 2)]),
     ):
-        if given is not None and np.shape(given) not in allowed:
+        if given is not None and (found := _shape(given)) not in allowed:
             words = " or ".join(map(str, allowed))
-            return f"{name} has the shape {np.shape(given)}; allowed is {words}, as r has {nc} contacts"
+            return f"{name} has the shape {found}; allowed is {words}, as r has {nc} contacts"
     for name, numbers, least in (("r", velocity, -np.inf), ("mu", friction, 0.0), ("compliance", soft, 0.0)):
         if not all_from(numbers.ravel(), least):
             wrong = np.flatnonzero(~(np.isfinite(numbers) & (numbers >= least)))
@@ -201,6 +201,10 @@ def _wrong_contacts(
     elif masses is not None and G is None:
         return "masses: N has them already; allowed with them is G"
     return ""
+
+
+def _shape(given: Any) -> tuple[int, ...]:
+    return given.shape if isinstance(given, np.ndarray) else np.shape(given)
 
 
 def _real(given: Any) -> Array:

@@ -359,7 +359,7 @@ class ConeProblem:
         return everywhere if here.ndim else everywhere.item()
 
     def dot(self, x: Array, y: Array) -> float:
-        return self.sum(float(np.vdot(x, y)))
+        return self.sum(float(x.ravel().dot(y.ravel())))
 
     def norm(self, x: Array) -> float:
         return math.sqrt(self.dot(x, x))

@@ -60,7 +60,7 @@ def with_islands(
     problem, to which ``solve`` is applied. Collective."""
     if limits.aim < 1.0 or not found.converged:
         return found
-    contacts, part = contacts_at_rest(world, system, _passing(system, _tools(world, system)), SLOW)
+    contacts, part = contacts_at_rest(world, system, _passing(world, system), SLOW)
     (count,), (part,) = reduced(world.comm, (len(contacts),), (part,))
     if not count:
         return found
@@ -94,7 +94,7 @@ def _kinetic_part(world: World, system: ContactSystem) -> float:
     (kinetic, fall, mass), _ = reduced(world.comm, [*map(sum, zip(*each))], ())
     if kinetic >= SLOW * fall:  # so a bed that is stirred pays for two sums
         return np.inf
-    _, (fastest,) = reduced(world.comm, (), (_passing(system, _tools(world, system)).max(initial=0.0),))
+    _, (fastest,) = reduced(world.comm, (), (_passing(world, system).max(initial=0.0),))
     passes = 0.5 * mass * fastest**2 > fall
     return np.inf if passes else float(kinetic / fall)
 
@@ -114,22 +114,17 @@ def energies_of_fall(
     return kinetic, fall, total
 
 
-def _tools(world: World, system: ContactSystem) -> Floats:
-    """The velocities (large, 6) of bodies of prescribed motion; zero of others."""
-    tools = system.free_large.copy()
-    tools[bodies.is_dynamic(world.large)] = 0.0
-    return tools
-
-
-def _passing(system: ContactSystem, tools: Floats) -> Floats:
-    """The greatest component (nc,) [m/s] of the velocity that tools with the velocities (large, 6), belts and the flow
-    of a cell have at each contact."""
+def _passing(world: World, system: ContactSystem) -> Floats:
+    """The greatest component (nc,) [m/s] of the velocity that tools, which are bodies of prescribed motion, belts and
+    the flow of a cell have at each contact."""
     at_contacts = [known for known in (system.surface, system.drift) if known is not None]
+    tools, most = system.free_large, np.zeros(len(system.contacts))
+    if world.large_moves:
+        tools = np.where(bodies.is_dynamic(world.large)[:, None], 0.0, tools)
     if tools.any():
         table = np.zeros(system.near.bodies.velocity.shape)
         table[len(table) - len(tools) :] = tools
         at_contacts.append(system.contact_map.relative_velocities(table))
-    most = np.zeros(len(system.contacts))
     for known in at_contacts:
         most = np.maximum(most, np.abs(known).max(axis=1, initial=0.0))
     return most

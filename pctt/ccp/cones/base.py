@@ -44,8 +44,8 @@ class Cones(ABC):
     def why_refused(self) -> str:
         """What is wrong with the coefficients, in words; else ""."""
         for name, values in self.named():
-            if np.shape(values) != (self.count,):
-                return f"{name} has the shape {np.shape(values)}; allowed is {(self.count,)}, one for each contact"
+            if values.shape != (self.count,):
+                return f"{name} has the shape {values.shape}; allowed is {(self.count,)}, one for each contact"
             if not all_from(values, 0.0):
                 bad = np.flatnonzero(~(np.isfinite(values) & (np.asarray(values) >= 0.0)))
                 return f"{name} is {values[bad[0]]} at contact {bad[0]}; allowed are finite numbers >= 0"

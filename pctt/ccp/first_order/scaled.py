@@ -125,7 +125,8 @@ class ScaledProblem:
         rows, self._active = self._active.rows, self._all
         if rows is not None:
             now, last = (self._scattered(iterate, rows) for iterate in (now, last))
-        return now, last, Iterate(np.empty_like(now.x), new.image), np.empty_like(now.x)
+        x, y = (np.empty(now.x.shape, now.x.dtype) for _ in range(2))
+        return now, last, Iterate(x, new.image), y
 
     def _scattered(self, iterate: Iterate, rows: Rows) -> Iterate:
         x = np.zeros_like(self.b)
