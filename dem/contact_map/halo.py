@@ -28,6 +28,7 @@ class Halo:
     own : number of own bodies
     rows : number of rows of a table
     ghosts : (n,) rows of the ghosts, in the order of their owners
+    talks : whether this rank shares ghosts with others
     """
 
     def __init__(self, comm: MPI.Comm, own: int, rows: int, ghosts: Ints, owner: np.ndarray, place: Ints):
@@ -38,7 +39,7 @@ class Halo:
         asked = exchange(comm, {"row": place, "rank": np.full(len(place), comm.rank)}, owner)
         self._shared = asked["row"]  # own rows that are ghosts elsewhere, by rank
         self._owners, self._holders = _pieces(owner), _pieces(asked["rank"])
-        self._talks = bool(self._owners or self._holders)  # whether this rank shares ghosts with others
+        self.talks = bool(self._owners or self._holders)
         self._messages: dict[tuple, Messages] = {}
         self._open: Messages | None = None
 
@@ -60,21 +61,21 @@ class Halo:
 
     def begin_update(self, values: np.ndarray) -> None:
         """Owners may change their values after this, and read those of ghosts after `end_update`."""
-        if self._talks:
+        if self.talks:
             self._send(values, self._shared, self.ghosts, self._holders, self._owners)
 
     def end_update(self, values: np.ndarray) -> None:
-        if self._talks:
+        if self.talks:
             for rows, arrived in self._wait():
                 _put(arrived, rows, _flat(values))
 
     def begin_add(self, values: np.ndarray) -> None:
         """Owners may still change their own values until `end_add`."""
-        if self._talks:
+        if self.talks:
             self._send(values, self.ghosts, self._shared, self._owners, self._holders)
 
     def end_add(self, values: np.ndarray) -> None:
-        if self._talks:
+        if self.talks:
             for rows, arrived in self._wait():  # in the order of the ranks, so that sums repeat themselves
                 _add(arrived, rows, _flat(values))
 

@@ -97,7 +97,7 @@ class ContactMap:
         y = shaped("velocities of contacts", y, self.rows, 3)
         self._collect(g, self._m)
         loops.scale(self.mass.unshared, self._m, self._w)
-        self._set_velocities(y, y, self._send(self._share(self._m)))
+        self._set_velocities(y, y, self._send(self._share(self._m) if self.mass.shared else None))
         self.log_flops(2 * self._flops)
 
     def shared(self, g: Floats) -> Floats:
@@ -148,8 +148,11 @@ class ContactMap:
 
     def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats) -> None:
         """y = before + G G' z (nc, 3) for the z whose image is image + beta (image - last)."""
-        loops.scale_extrapolated(self.mass.unshared, image, last, beta, self._w)
-        self._set_velocities(before, y, self._send(self._shared_at(image, last, beta)))
+        mass, shared = self.mass, None
+        loops.scale_extrapolated(mass.unshared, image, last, beta, self._w)
+        if mass.shared:
+            shared = self._shared_at(image, last, beta)
+        self._set_velocities(before, y, self._send(shared))
         self.log_flops(self._flops + 12 * self.columns)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
@@ -162,7 +165,7 @@ class ContactMap:
     def _shared_at(self, image: Floats, last: Floats, beta: float) -> Floats:
         """The shared coordinates (mass.shared, 6) of z."""
         now, before = image[self.halo.rows :], last[self.halo.rows :]
-        return now + self.precision(beta) * (now - before) if self.mass.shared else now
+        return now + self.precision(beta) * (now - before)
 
     def weights(self, H: Floats, symmetric: bool = True) -> Floats:
         """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
@@ -231,19 +234,23 @@ class ContactMap:
         self.mass.share(m, self._pushed, shared)
         return shared
 
-    def _send(self, shared: Floats) -> Floats:
-        """Add the velocities by shared coordinates to those of the own bodies, and begin to send them as `_enter`;
-        returns the rates (axes,) of a cell."""
-        if len(shared):
-            self.mass.add_bodies(shared, self._w)
-        self.halo.begin_update(self._w)
-        return self.mass.rates(shared)
+    def _send(self, shared: Floats | None) -> Floats:
+        """Add the velocities by shared coordinates, if there are any, to those of the own bodies, and begin to send
+        them as `_enter`; returns the rates (axes,) of a cell."""
+        rates, mass = self.mass.none, self.mass
+        if shared is not None:
+            mass.add_bodies(shared, self._w)
+            rates = mass.rates(shared)
+        if self.halo.talks:
+            self.halo.begin_update(self._w)
+        return rates
 
     def _set_velocities(self, before: Floats, y: Floats, rate: Floats) -> None:
         """y = before + D' w (nc, 3), with the velocities w that are on their way, and the rates of a cell."""
         here, frame, arm, body = self._own
         loops.set_velocities(frame, arm, body, before[here], y[here], self._w, rate)
-        self.halo.end_update(self._w)
+        if self.halo.talks:
+            self.halo.end_update(self._w)
         for here, frame, arm, body in self._away:
             loops.set_velocities(frame, arm, body, before[here], y[here], self._w, rate)
 
@@ -263,10 +270,12 @@ class ContactMap:
         m[:] = 0.0
         for here, frame, arm, body in self._away:
             loops.add_momenta(frame, arm, body, g[here], m, self._pushed)
-        self.halo.begin_add(m)
-        here, frame, arm, body = self._own
+        halo, (here, frame, arm, body) = self.halo, self._own
+        if halo.talks:
+            halo.begin_add(m)
         loops.add_momenta(frame, arm, body, g[here], m, self._pushed)
-        self.halo.end_add(m)
+        if halo.talks:
+            halo.end_add(m)
 
     def _sum_forces(self, m: Floats) -> None:
         """m = the momenta of the bodies by the impulses in ``_forces``, on several threads."""

@@ -254,6 +254,7 @@ class Progress:
     def __init__(self, problem: ScaledProblem, limits: Limits, options: FirstOrder, before: Progress | None = None):
         """``before`` is the progress in lower precision, whose iterations and history go on."""
         self.problem, self.limits, self.check, self.patience = problem, limits, options.check, options.patience
+        self._aimed = limits.aimed
         self.iterations: int = before.iterations if before else 0
         self.history: list[float] = before.history if before else []
         self.status, self.reason = Status.STALLED, ""
@@ -272,7 +273,7 @@ class Progress:
 
         Before there was a step it is taken for RATIO times |L step| / |x|."""
         residual, size_then = self._last_look
-        wanted = self.limits.tol if self._met is None else self.limits.aimed
+        wanted = self.limits.tol if self._met is None else self._aimed
         early = self._next_look - self.check + 3
         if self.iterations >= early and residual * size <= 0.9 * wanted * size_then:
             self._next_look = self.iterations
@@ -349,7 +350,7 @@ class Progress:
         if self._lowest < -ROUNDED and not self._unbounded:
             words = f"N is indefinite: d'Nd / d'd is {self._lowest:.1g} of the greatest for a step d"
             return Status.BREAKDOWN, words
-        if residual <= self.limits.aimed or (self._met is not None and self.beyond >= self.limits.spare):
+        if residual <= self._aimed or (self._met is not None and self.beyond >= self.limits.spare):
             return Status.CONVERGED, self.limits.met
         if self._unbounded:
             return Status.UNBOUNDED, self._unbounded
