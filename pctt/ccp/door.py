@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from operator import neg
 from typing import Any, Union
 
 import numpy as np
@@ -95,11 +96,11 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: An
         words = _wrong_contacts(r, mu, **data)
     if (data.get("G") is None) == (N is None):
         words = "a cone problem is given by either the map G or the matrix N"
-    velocity, friction = (np.zeros(0), np.zeros(0)) if words else (np.asarray(each, dtype=float) for each in (r, mu))
+    velocity, friction = (np.zeros(0), np.zeros(0)) if words else (np.asarray(r, float), np.asarray(mu, float))
     flat, space = velocity.ndim == 2 and velocity.shape[1] == 2, velocity.ndim == 2 and velocity.shape[1] == 3
     space = space or (velocity.ndim == 1 and velocity.size > 0)
     facts = bool(words), flat, space, friction.ndim == 2, parts == 1, parts > 1
-    _, most = reduced(comm, (), (*facts, *kinds, *(-kind for kind in kinds)))
+    _, most = reduced(comm, (), (*facts, *kinds, *map(neg, kinds)))
     wrong, plane, spatial, elliptic, plain, moments, *every = map(int, most)
     if wrong:
         refuse(comm, words)

@@ -336,7 +336,7 @@ class ConeProblem:
 
     def sum(self, x):
         """Over all ranks, of a number or an array."""
-        return self._reduced(x, MPI.SUM)
+        return x if self.comm.size == 1 else self._reduced(x, MPI.SUM)
 
     def sums(self, *parts: float) -> Sequence[float]:
         """Of numbers over all ranks, in one reduction."""

@@ -124,8 +124,8 @@ class ScaledProblem:
         """The iterates with all contacts, memory for a new one, and memory (nc, 3) for a gradient."""
         rows, self._active = self._active.rows, self._all
         if rows is not None:
-            now, last = (self._scattered(iterate, rows) for iterate in (now, last))
-        x, y = (np.empty(now.x.shape, now.x.dtype) for _ in range(2))
+            now, last = self._scattered(now, rows), self._scattered(last, rows)
+        x, y = np.empty((2, *self.b.shape), self.b.dtype)
         return now, last, Iterate(x, new.image), y
 
     def _scattered(self, iterate: Iterate, rows: Rows) -> Iterate:
@@ -156,7 +156,7 @@ class ScaledProblem:
         assert isinstance(every.operator, ContactMap)
         operator, cones = every.operator.only(contacts), self.cones.only(contacts)
         self._active = ActiveSet(rows, operator, cones, active(every.b), active(every.compliance))
-        return now, last, Iterate(np.empty_like(y), new.image), y
+        return now, last, Iterate(np.empty(y.shape, y.dtype), new.image), y
 
     def step(self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate) -> Sequence[float]:
         """The projected step of this length from z, where the rigid gradient is y, into ``new``; of the step d from z
