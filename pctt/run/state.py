@@ -380,7 +380,7 @@ def _settle(
     with Stepper(loose, world, memory) as stepper:
         while world.step < end:
             if world.step + 1 >= end - end // 10:
-                stepper.settings = dataclasses.replace(loose, delta=at_rest, tol=0.1 * tol)
+                stepper.use(dataclasses.replace(loose, delta=at_rest, tol=0.1 * tol))
             made = stepper.step()
             stepper.take(made)
             line = made.figures

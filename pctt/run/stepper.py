@@ -65,13 +65,17 @@ class Stepper:
         newton: ccp.Newton | None = None,
         dump: Dump | None = None,
     ):
-        self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
-        self._limits = settings.limits
+        self.world, self.memory, self.newton, self.dump = world, memory, newton, dump
+        self.use(settings)
         self._slabs: Ints | None = None  # those of the last step, whose impulses the memory has
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
         if world.cell.deforms and not np.isfinite(world.pairs.stiffness).all():
             raise OptionError("stiffness inf: a cell of given stress needs contacts that give way; allowed is less")
+
+    def use(self, settings: Settings) -> None:
+        """Make the next steps by these settings."""
+        self.settings, self._limits = settings, settings.limits
 
     def __enter__(self) -> Stepper:
         return self
