@@ -69,16 +69,9 @@ Moving = tuple[Floats, Floats, Bools, float]  #: a `Course`
 Touching = tuple[Floats, Floats, Floats, Bools]  #: a `Touch`, and which are of `dem.contact.primitives.on_faces`
 
 
-def hosts_first(one: Ints, two: Ints) -> Bools:
-    """Of which pairs of kinds (m,) the second is the guest."""
-    one, two = (np.where(kind >= CONVEX, CLUMP + 1, np.minimum(kind, CLUMP)) for kind in (one, two))
-    first: Bools = RANK[one] > RANK[two]
-    return first
-
-
 @inlined
 def guest_is_second(one, two):
-    """The same of one pair."""
+    """Whether of a pair of kinds the second is the guest."""
     first = RANK[CLUMP + 1 if one >= CONVEX else min(one, CLUMP)]
     return first > RANK[CLUMP + 1 if two >= CONVEX else min(two, CLUMP)]
 

@@ -60,14 +60,14 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     faster than a fall of one step; without restitution those of two that are near no other. Two spheres that pass each
     other have no contact that closes. In cells that deform, and where bodies attract each other, nothing is
     followed."""
-    if world.cell.moves or world.pairs.attracts:
+    if world.cell.moves or world.pairs.attracts or not world.any_spheres:
         return contacts
     near, table, pairs, dt = contacts.near, contacts.near.bodies, world.pairs, motion.dt
     grains, old = near.grains + near.ghosts, table.velocity
     ball = table.shape == SPHERE
     ball[grains:] = False
     ball[slots(world, table.id)[0]] = False
-    if pairs.restitution.any():
+    if pairs.bounces:
         old = old.copy()
         old[grains:] = motion.prescribed
     image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
