@@ -227,7 +227,7 @@ def touches_ahead(
     rows of bodies, so many, are `grains`. A deep gap is no deeper than the pair overlaps at the start, and none is
     wider than `delta` there."""
     found = touches(table, i, j, delta, course)
-    touch = (*found.touch, on_faces(table, i[found.pair], j[found.pair], found, course.moves, grains))
+    touch = (*found.touch, on_faces(table, i, j, found, course.moves, grains))
     given, arcs = (*table.tables(), course[:], i, j, found.pair, touch), np.zeros((0, 4, 3))
     if (table.kind >= CONVEX).any():
         arcs = arcs_of(*given, table.supports[:])
@@ -243,16 +243,17 @@ def touches_ahead(
     return found, moved, swing, linear
 
 
-def on_faces(table: Primitives, one: Ints, two: Ints, found: Manifold, moves: Bools, grains: int) -> Bools:
-    """Which contacts (nc,) of the rows `one` and `two` (nc,) are of round guests on flat faces of hosts that impulses
-    move, by the rows of bodies `moves`. Grains are no guests: what rests on a bed of them would tremble."""
-    kind, flat = table.kind, np.zeros(len(one), np.bool_)
-    if not (faces := moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)).any():
+def on_faces(table: Primitives, i: Ints, j: Ints, found: Manifold, moves: Bools, grains: int) -> Bools:
+    """Which contacts (nc,) of pairs of rows i, j (m,) are of round guests on flat faces of hosts that impulses move, by
+    the rows of bodies `moves`. Grains are no guests: what rests on a bed of them would tremble."""
+    kind, flat = table.kind, np.zeros(len(found.pair), np.bool_)
+    is_round = (kind == SPHERE) | (kind == CAPSULE) | (kind >= CONVEX)
+    guests = is_round & (table.row >= grains)
+    if not guests.any():
         return flat
-    swap = hosts_first(kind[one], kind[two])
-    guest, host = np.where(swap, two, one), np.where(swap, one, two)
-    is_round = (kind[guest] == SPHERE) | (kind[guest] == CAPSULE) | (kind[guest] >= CONVEX)
-    rows = np.flatnonzero(faces[host] & is_round & (table.row[guest] >= grains))
+    guest, host, swap, _ = guests_and_hosts(kind, i, j, found.pair)
+    faces = moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)
+    rows = np.flatnonzero(faces[host] & guests[guest])
     away = found.touch.normal * np.where(swap, 1.0, -1.0)[:, None]
     flat[rows[kind[host[rows]] == PLANE]] = True
     for row in table.surfaces:
