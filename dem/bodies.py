@@ -9,7 +9,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints, Tabular
-from dem.compiled import loop
+from dem.compiled import inlined, loop
 
 #: Kinds of bodies (the column `shape`); a COMPOUND is a large body, its primitives are kept elsewhere. Half spaces and
 #: meshes are parts of large bodies only.
@@ -89,13 +89,19 @@ def enclosing_radius(kind: Ints, size: Floats) -> Floats:
     """Radius (n,) of the sphere about the centre that encloses a shape of kind (n,) and size (n, 3) [m]."""
     out = np.empty(len(kind))
     for n in range(len(kind)):
-        if kind[n] == CAPSULE:
-            out[n] = size[n, 0] + size[n, 1]
-        elif kind[n] >= FORM:
-            out[n] = size[n, 0]
-        else:
-            out[n] = np.sqrt(size[n, 0] ** 2 + size[n, 1] ** 2 + size[n, 2] ** 2)
+        out[n] = radius_about(kind[n], size[n])
     return out
+
+
+@inlined
+def radius_about(kind, size):
+    """The same of one shape."""
+    radius = np.sqrt(size[0] ** 2 + size[1] ** 2 + size[2] ** 2)
+    if kind == CAPSULE:
+        radius = size[0] + size[1]
+    elif kind >= FORM:
+        radius = size[0]
+    return radius
 
 
 def least_half_thickness(bodies: Bodies) -> Floats:
@@ -113,9 +119,17 @@ def half_thickness(kind: Ints, size: Floats) -> Floats:
 def turning(bodies: Bodies) -> Floats:
     """Return angular speeds (n,) of bodies that are no spheres [rad/s]; zero of spheres, and of what does not turn
     freely."""
-    x, y, z = bodies.velocity[:, 3:].T
-    speed: Floats = np.hypot(np.hypot(x, y), z)  # squares could overflow
-    return np.where((bodies.shape == SPHERE) | np.isinf(bodies.inertia).any(axis=1), 0.0, speed)
+    return _turning(bodies.velocity, bodies.inertia, bodies.shape)
+
+
+@loop
+def _turning(velocity: Floats, inertia: Floats, shape: Ints) -> Floats:
+    out = np.zeros(len(shape))
+    for n in range(len(shape)):
+        held = np.isinf(inertia[n, 0]) or np.isinf(inertia[n, 1]) or np.isinf(inertia[n, 2])
+        if shape[n] != SPHERE and not held:
+            out[n] = np.hypot(np.hypot(velocity[n, 3], velocity[n, 4]), velocity[n, 5])  # squares could overflow
+    return out
 
 
 def inverse_root_inertia(bodies: Bodies) -> Floats:

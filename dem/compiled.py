@@ -25,6 +25,7 @@ PART = 4096  #: rows of a sum's part: 100 kB of impulses, enough work for a thre
 
 _INNER = {"no_cpython_wrapper": True}  # of what compiled loops alone call
 _threads = 1
+_spreading: list[Loop] = []  # the loops whose passes go to threads
 
 
 def threads() -> int:
@@ -50,18 +51,30 @@ def set_threads(count: int) -> None:
             )
         numba.set_num_threads(count)
     _threads = count
+    for each in _spreading:
+        each.__call__ = each._first
 
 
 class Loop:
     """A function that is compiled at its first call."""
 
+    #: What is called in its place, which Python looks up in the class, and finds here: a method would be one more call
+    #: of Python each time, and loops over few rows cost what their calls cost.
+    __slots__ = ("__call__", "__dict__")
+    __call__: Callable[..., Any]
+
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]):
         update_wrapper(self, function)
         self._function, self._options = function, {"error_model": "numpy", "no_cfunc_wrapper": True, **options}
         self._spreads = "prange" in function.__code__.co_names
+        self.__call__ = self._first
+        if self._spreads:
+            _spreading.append(self)
 
-    def __call__(self, *arguments: Any) -> Any:
-        return (self._on_threads if self._spreads and _threads > 1 else self.compiled)(*arguments)
+    def _first(self, *arguments: Any) -> Any:
+        """The first call, for this number of threads."""
+        self.__call__ = self._on_threads if self._spreads and _threads > 1 else self.compiled
+        return self.__call__(*arguments)
 
     @cached_property
     def compiled(self) -> Callable[..., Any]:

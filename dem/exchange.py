@@ -81,7 +81,7 @@ def offsets(comm: MPI.Comm, count: int) -> Ints:
 def on_any(comm: MPI.Comm, *here: bool) -> list[bool]:
     """Of each of some facts, whether it holds on any rank; collective, without a message per rank."""
     if comm.size == 1:
-        return [bool(fact) for fact in here]
+        return list(map(bool, here))
     held = np.array(here, dtype=np.int64)
     comm.Allreduce(MPI.IN_PLACE, held, MPI.MAX)
     return held.astype(bool).tolist()

@@ -4,8 +4,8 @@ The velocities of a step are those of its middle. Impulses act at its start. A b
 angular momentum L(w) = exp(dt/2 w) I w in the middle of the step, with the inertia I of its start, and impulses J of
 contacts, joints, springs and loads are to give L(w) = L_old + J. The cone problem needs velocities that are linear in
 the impulses: they are so about the spin that the impulses of the last step would lead to (`free_spin`). What they miss
-of the angular momentum is of third order in dt where forces change smoothly, and `kept_spin` gives it back at the end
-of the step: no impulse is lost.
+of the angular momentum is of third order in dt where forces change smoothly, and `kept_velocities` gives it back at the
+end of the step: no impulse is lost.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import SPHERE, Bodies
-from dem.compiled import inlined, loop
+from dem.compiled import inlined, inner, loop
 from dem.geometry.vectors import cross, dot, plus, shares, turned
 
 
@@ -24,20 +24,10 @@ def free_velocity(table: Bodies, gravity: Floats, dt: float) -> Floats:
 
     Rows of bodies with prescribed motion come back as they are.
     """
-    velocity, others = fallen(table, gravity, dt)
-    if not others:  # the torque vanishes where all moments are equal, as for spheres
-        return velocity
-    rows = gyroscopic(table)
-    spin = velocity[rows, 3:]
-    velocity[rows, 3:], _ = free_spin(table.quaternion[rows], spin, table.inertia[rows], dt, np.zeros(spin.shape))
+    velocity, others = falling(table.velocity, table.mass, table.shape, gravity, dt)
+    if others:  # the torque vanishes where all moments are equal, as for spheres
+        spin_freely(table, velocity, np.zeros((len(velocity), 3)), np.zeros(velocity.shape), dt)
     return velocity
-
-
-def fallen(table: Bodies, gravity: Floats, dt: float) -> tuple[Floats, int]:
-    """Velocities (n, 6) after dt [s] under gravity (3,) alone, and how many bodies that forces move are no spheres."""
-    with np.errstate(over="ignore"):  # `dem.model.neighbourhood` refuses bodies that are lost
-        change = dt * gravity
-    return falling(table.velocity, table.mass, table.shape, change)
 
 
 def velocity_changes(table: Bodies, impulse: Floats) -> Floats:
@@ -47,15 +37,18 @@ def velocity_changes(table: Bodies, impulse: Floats) -> Floats:
     change[:, :3] = impulse[:, :3] / table.mass[:, None]
     change[:, 3:] = impulse[:, 3:] / table.inertia  # of spheres
     rows = (impulse[:, 3:].any(axis=1) & (table.shape != bodies.SPHERE)).nonzero()[0]
-    root = bodies.inverse_root_inertia(table.take(rows))
-    change[rows, 3:] = (root @ (root @ impulse[rows, 3:, None]))[:, :, 0]
+    if len(rows):
+        root = bodies.inverse_root_inertia(table.take(rows))
+        change[rows, 3:] = (root @ (root @ impulse[rows, 3:, None]))[:, :, 0]
     return change
 
 
-def gyroscopic(table: Bodies) -> Ints:
-    """The rows of bodies that turn freely and whose three moments are not equal."""
-    rows = (bodies.is_dynamic(table) & (table.shape != SPHERE)).nonzero()[0]
-    return rows[unequal(table.inertia[rows])]
+def spin_freely(table: Bodies, velocity: Floats, given: Floats, expected: Floats, dt: float) -> Floats:
+    """Let the first bodies of a table, whose angular velocities get the changes `given` (m, 3) by forces and `expected`
+    (m, 6), of all velocities, by impulses, spin in the `velocity` (n, 6) of a step as `free_spin` says. Returns what
+    that returns with impulses (m, 3): NaN of bodies that do not turn freely, or whose moments are equal."""
+    numbers = table.quaternion, table.velocity, table.inertia
+    return spin_others(*numbers, (table.mass, table.shape), given, expected, dt, velocity)
 
 
 def unequal(moments: Floats) -> Bools:
@@ -67,15 +60,15 @@ def unequal(moments: Floats) -> Bools:
 
 
 @loop
-def falling(velocity: Floats, mass: Floats, shape: Ints, change: Floats) -> tuple[Floats, int]:
-    """The velocities (n, 6), with a change (3,) of the linear ones of bodies whose mass (n,) is finite, and how many of
-    these are no spheres."""
+def falling(velocity: Floats, mass: Floats, shape: Ints, gravity: Floats, dt: float) -> tuple[Floats, int]:
+    """The velocities (n, 6) after dt [s] under gravity (3,) alone of bodies whose mass (n,) is finite, those of the
+    others, and how many of the former are no spheres."""
     out, others = velocity.copy(), 0
     for n in range(len(mass)):
         if np.isfinite(mass[n]):
             others += shape[n] != SPHERE
             for k in range(3):
-                out[n, k] += change[k]
+                out[n, k] += dt * gravity[k]
     return out, others
 
 
@@ -94,41 +87,64 @@ def free_spin(turn: Floats, spin: Floats, moments: Floats, dt: float, change: Fl
     keeps its spin, and the second one is NaN.
     """
     out, middle = spin.copy(), np.full_like(spin, np.nan)
-    half = 0.5 * dt
     for n in range(len(spin)):
-        frame, twice = (turn[n, 1], turn[n, 2], turn[n, 3]), 2.0 * turn[n, 0]
-        w = turned((spin[n, 0], spin[n, 1], spin[n, 2]), frame, -twice, 2.0)
-        c = turned((change[n, 0], change[n, 1], change[n, 2]), frame, -twice, 2.0)
-        inertia = _shape_of(moments[n])
-        rotation = plus(_ZERO, half, w)
-        sine, versed = shares(rotation)
-        momentum = turned(_each(inertia, w), rotation, -sine, versed)
-        for share in (1.0, 0.0):
-            new, found = _spin_of(inertia, plus(momentum, share, _each(inertia, c)), plus(w, share, c), half)
-            if found:
-                without = turned(plus(new, -share, c), frame, twice, 2.0)
-                new = turned(new, frame, twice, 2.0)
-                for k in range(3):
-                    out[n, k], middle[n, k] = without[k], new[k]
-                break
+        _spin_one(turn[n], spin[n], moments[n], dt, (change[n, 0], change[n, 1], change[n, 2]), out[n], middle[n])
     return out, middle
 
 
 @loop
-def kept_spin(turn: Floats, spin: Floats, middle: Floats, moments: Floats, dt: float) -> Floats:
-    """The angular velocities (n, 3) [rad/s] with which bodies go into the next step, where they have turned with `spin`
-    (n, 3) in one of dt [s] about which their velocities were linear at `middle` (n, 3), see `free_spin`.
+def spin_others(turn, old, inertia, kinds, given, expected, dt, out):
+    """The loop of `spin_freely`, with the velocities `old` (n, 6), and the masses and shapes (n,) as `kinds`."""
+    (mass, shape), middle = kinds, np.full(given.shape, np.nan)
+    for n in range(len(given)):
+        a, b, c = inertia[n, 0], inertia[n, 1], inertia[n, 2]
+        if np.isfinite(mass[n]) and shape[n] != SPHERE and np.isfinite(a + b + c) and (a != b or b != c):
+            out[n, 3:] = old[n, 3:]
+            change = given[n, 0] + expected[n, 3], given[n, 1] + expected[n, 4], given[n, 2] + expected[n, 5]
+            _spin_one(turn[n], old[n, 3:], inertia[n], dt, change, out[n, 3:], middle[n])
+            for k in range(3):
+                out[n, 3 + k] += given[n, k]
+    return middle
 
-    The momentum in the middle of the step is L(middle) + I (spin - middle), and that of the angular velocity w in the
-    orientation of the end is exp(-dt/2 w) I w, the same where spin is middle. Newton's method finds w.
-    """
-    out = spin.copy()
+
+@inner
+def _spin_one(turn, spin, moments, dt, change, out, middle):
+    """The two spins of `free_spin` of one body, where they are found."""
     half = 0.5 * dt
-    for n in range(len(spin)):
+    frame, twice = (turn[1], turn[2], turn[3]), 2.0 * turn[0]
+    w = turned((spin[0], spin[1], spin[2]), frame, -twice, 2.0)
+    c = turned(change, frame, -twice, 2.0)
+    inertia = _shape_of(moments)
+    rotation = plus(_ZERO, half, w)
+    sine, versed = shares(rotation)
+    momentum = turned(_each(inertia, w), rotation, -sine, versed)
+    for share in (1.0, 0.0):
+        new, found = _spin_of(inertia, plus(momentum, share, _each(inertia, c)), plus(w, share, c), half)
+        if found:
+            without = turned(plus(new, -share, c), frame, twice, 2.0)
+            new = turned(new, frame, twice, 2.0)
+            for k in range(3):
+                out[k], middle[k] = without[k], new[k]
+            break
+
+
+@loop
+def kept_velocities(turn: Floats, velocity: Floats, middle: Floats, moments: Floats, dt: float) -> Floats:
+    """The velocities (n, 6) with which bodies go into the next step, where they have moved with `velocity` (n, 6) in
+    one of dt [s], and their angular velocities were linear about `middle` (n, 3), see `free_spin`; NaN: the same.
+    Orientations and moments may be those of more bodies.
+
+    With the spin of the step the momentum in its middle is L(middle) + I (spin - middle), and that of the angular
+    velocity w in the orientation of the end is exp(-dt/2 w) I w, the same where spin is middle. Newton's method finds
+    w.
+    """
+    out = velocity.copy()
+    half = 0.5 * dt
+    for n in range(len(velocity)):
         if np.isnan(middle[n, 0]):
             continue
         frame, twice = (turn[n, 1], turn[n, 2], turn[n, 3]), 2.0 * turn[n, 0]
-        w = turned((spin[n, 0], spin[n, 1], spin[n, 2]), frame, -twice, 2.0)
+        w = turned((velocity[n, 3], velocity[n, 4], velocity[n, 5]), frame, -twice, 2.0)
         x = turned((middle[n, 0], middle[n, 1], middle[n, 2]), frame, -twice, 2.0)
         inertia = _shape_of(moments[n])
         rotation = plus(_ZERO, half, x)
@@ -141,7 +157,7 @@ def kept_spin(turn: Floats, spin: Floats, middle: Floats, moments: Floats, dt: f
         if found:
             new = turned(turned(new, rotation, sine, versed), frame, twice, 2.0)
             for k in range(3):
-                out[n, k] = new[k]
+                out[n, 3 + k] = new[k]
     return out
 
 

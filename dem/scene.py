@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import partial, wraps
+from functools import cached_property, partial, wraps
 from inspect import Parameter, signature
 from typing import Any, TypeVar, Union, cast
 
@@ -28,7 +28,7 @@ from dem.arrays import ArrayLike, Floats, Ints, Rule, frozen
 from dem.bodies import BOX, CAPSULE, COMPOUND, PLANE, SPHERE, Bodies
 from dem.geometry.region import Block, Cylinder
 from dem.geometry.survey import Survey, survey
-from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, refuse_ignored
+from dem.motion import Driven, Dynamic, Fixed, Guided, Held, Hinged, Motion, Pose, checked_pose, refuse_ignored
 from dem.parts import cell, contact_law
 from dem.parts.contact_law import ContactLaw
 from dem.parts.ends import End
@@ -84,6 +84,17 @@ class LargeBody:
     mass: float  #: infinite unless the motion is dynamic [kg]
     inertia: Floats  #: (3,) principal moments in the body frame; infinite if the body cannot turn [kg m^2]
     surface: SurfaceVelocity | None = None  #: of its surface along itself, in the body frame [m/s]
+
+    def pose(self, time: float) -> Pose:
+        """The pose at a time [s], of a motion that does not answer to forces. ValueError if it is none."""
+        return self._rest if type(self.motion) is Fixed else self._pose(time)
+
+    @cached_property
+    def _rest(self) -> Pose:
+        return self._pose(0.0)
+
+    def _pose(self, time: float) -> Pose:
+        return checked_pose(self.motion, time, self.position, self.quaternion)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dem.compiled import loop
+
 Array = NDArray[np.float64]
 TINY = float(np.finfo(float).tiny)  #: the least positive number with all digits
+
+
+@loop
+def all_from(x: Array, least: float) -> bool:
+    """Whether all numbers (n,) are finite, and not below the least."""
+    wrong = 0
+    for k in range(len(x)):
+        wrong += not (np.isfinite(x[k]) and x[k] >= least)
+    return wrong == 0
 
 
 def tangential(x: Array) -> Array:

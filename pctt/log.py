@@ -5,29 +5,33 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Iterable
+from functools import cache
 
 from petsc4py import PETSc
 
 _seconds: dict[str, float] = defaultdict(float)
-_events: dict[str, PETSc.LogEvent] = {}
 
 
-class phase:  # noqa: N801 - it is used as a function
-    """Log a phase as the event ``name``, and add its wall seconds on this rank to the account of ``name``: ``with
-    phase(name):``. (The context manager of a generator takes four times as long.)"""
+class Phase:
+    """What ``with`` begins and ends, again and again. (The context manager of a generator takes four times as long.)"""
 
     def __init__(self, name: str):
-        self.name = name
+        self.name, self._event, self._starts = name, PETSc.Log.Event(name), list[float]()
 
     def __enter__(self) -> None:
-        if self.name not in _events:
-            _events[self.name] = PETSc.Log.Event(self.name)
-        self._start = time.perf_counter()
-        _events[self.name].begin()
+        self._starts.append(time.perf_counter())
+        self._event.begin()
 
     def __exit__(self, *exception: object) -> None:
-        _events[self.name].end()
-        _seconds[self.name] += time.perf_counter() - self._start
+        self._event.end()
+        _seconds[self.name] += time.perf_counter() - self._starts.pop()
+
+
+@cache
+def phase(name: str) -> Phase:
+    """Log a phase as the event ``name``, and add its wall seconds on this rank to the account of ``name``: ``with
+    phase(name):``."""
+    return Phase(name)
 
 
 def move_seconds(seconds: float, source: str, target: str) -> None:

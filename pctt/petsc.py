@@ -147,12 +147,15 @@ def options_database(prefix: str = "") -> dict[str, str]:
     ``PETSc.Options().getAll()`` cuts a value at its blanks, and takes words of it for options. So PETSc lists those
     that nobody has asked for, and each of the others is looked up. So none counts as asked for that did not before.
     """
+    every = PETSc.Options().getAll()
+    if not every:
+        return {}
     count, names, values = _INT(), ctypes.POINTER(ctypes.c_char_p)(), ctypes.POINTER(ctypes.c_char_p)()
     left = ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)
     _library.PetscOptionsLeftGet(None, *left)
     found = {names[k].decode(): (values[k] or b"").decode() for k in range(count.value)}
     _library.PetscOptionsLeftRestore(None, *left)
-    found |= {name: _looked_up(name) for name in PETSc.Options().getAll() if name not in found and is_used(name)}
+    found |= {name: _looked_up(name) for name in every if name not in found and is_used(name)}
     return {name[len(prefix) :]: value for name, value in sorted(found.items()) if name.startswith(prefix)}
 
 

@@ -38,6 +38,7 @@ from dem.motion import Motion
 from dem.parts.loads import Load
 from dem.parts.sources import Tally
 from dem.parts.springs import Spring
+from dem.record.energies import energy
 from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.start import step_remark
 from dem.start.time_step import fall_remark, reason
@@ -375,8 +376,8 @@ class Simulation:
     def kinetic_energy(self) -> float:
         """Of all bodies that forces move [J]."""
         tables = [self.world.grains] + [self.world.large] * (self.comm.rank == 0)
-        energy = sum(recording.energy(table, self.world.gravity)[0] for table in tables)
-        return barrier(self.comm, "kinetic_energy of a Simulation", number=energy)
+        kinetic = sum(energy(table, self.world.gravity)[0] for table in tables)
+        return barrier(self.comm, "kinetic_energy of a Simulation", number=kinetic)
 
     @property
     def contacts(self) -> Contacts:

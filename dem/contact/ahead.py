@@ -20,9 +20,10 @@ along each other in the step, the term with dt/2, is foreseen and added (`Contac
 with another one does not creep on it. Bodies of prescribed motion have the arms of the end, as normals: a tool does the
 work that its force does at the speed of its face.
 
-Round bodies on a flat face that impulses move have its normal of the start, too. The normal turns with the face, and
-the place goes along the face as it rolls on them: with the normal of the end, and arms along it, each step would take
-energy from a plank that rocks on a log, to first order.
+Large round bodies on a flat face that impulses move have its normal of the start, too. The normal turns with the face,
+and the place goes along the face as it rolls on them: with the normal of the end, and arms along it, each step would
+take energy from a plank that rocks on a log, to first order. What rests on round grains keeps that of the end, which
+damps it.
 
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
@@ -68,16 +69,9 @@ Moving = tuple[Floats, Floats, Bools, float]  #: a `Course`
 Touching = tuple[Floats, Floats, Floats, Bools]  #: a `Touch`, and which are of `dem.contact.primitives.on_faces`
 
 
-def hosts_first(one: Ints, two: Ints) -> Bools:
-    """Of which pairs of kinds (m,) the second is the guest."""
-    one, two = (np.where(kind >= CONVEX, CLUMP + 1, np.minimum(kind, CLUMP)) for kind in (one, two))
-    first: Bools = RANK[one] > RANK[two]
-    return first
-
-
 @inlined
 def guest_is_second(one, two):
-    """The same of one pair."""
+    """Whether of a pair of kinds the second is the guest."""
     first = RANK[CLUMP + 1 if one >= CONVEX else min(one, CLUMP)]
     return first > RANK[CLUMP + 1 if two >= CONVEX else min(two, CLUMP)]
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from dem import bodies, quaternion
+from dem import bodies
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, MESH, PLANE
 from dem.compiled import loop
 from dem.contact.lists import Lists, Rows
 from dem.contact.primitives import Primitives
+from dem.contact.spheres import frame_of
 from dem.model.neighbourhood import Neighbourhood
 from dem.model.world import World
 from dem.quaternion import cross, length
@@ -36,10 +37,12 @@ def meeting(
     surfaces, if the bodies move and turn by any of the `shifts` (k, large, 6) [m, rad]."""
     last = world.comm.rank == world.comm.size - 1
     first = near.grains + near.ghosts
-    foreign = bodies.is_dynamic(world.large)[table.row[first:] - first] & (not last)
+    foreign = np.zeros(len(table.row) - first, np.bool_)
+    if not last:
+        foreign = bodies.is_dynamic(world.large)[table.row[first:] - first]
     found = [_of_grains(near, lists.own, ~foreign, table, delta, shifts, grown)]
     if last:
-        if bodies.is_dynamic(world.large).any():
+        if world.large_moves:
             found.append(_of_large(world, near, table, delta, shifts))
     else:
         found.append(_of_grains(near, lists.away, foreign, table, delta, shifts, grown))
@@ -74,11 +77,8 @@ def _of_grains(
     """Pairs of local grains with those in their rows, and with the `wanted` (parts,) parts of large bodies, of which a
     grain has `grown` (grains + ghosts,)."""
     first = near.grains + near.ghosts
-    part = first + wanted.nonzero()[0]
-    turn = quaternion.matrix(table.quaternion[part]).reshape(-1, 9)
-    turning, travel = shifts[:, :, 3:].any(axis=(0, 2)), length(shifts[:, :, :3]).max(axis=0)
-    grains, parts = (rows.start, rows.other, near.margin, grown), (part, table.row[part] - first, turn)
-    least = np.maximum(0.5 * delta, np.where(turning, 0.0, travel))
+    part, body, turn, turning, least = prepared(wanted, first, table.row, table.quaternion, shifts, delta)
+    grains, parts = (rows.start, rows.other, near.margin, grown), (part, body, turn)
     given = grains, parts, (near.bodies.position[first:], shifts, turning, least)
     shapes = table.kind, table.center, table.size, table.radius
     done, found, room = 0, 0, len(rows.other) + near.grains + len(part)
@@ -90,6 +90,32 @@ def _of_grains(
             return i[:found], j[:found], reach[:found]
         i, j, reach = (np.concatenate([column, np.empty_like(column)]) for column in out)
         out = i, j, reach
+
+
+@loop
+def prepared(
+    wanted: Bools, first: int, row: Ints, quaternion: Floats, shifts: Floats, delta: float
+) -> tuple[Ints, Ints, Floats, Bools, Floats]:
+    """The `Parts` of those `wanted`, in rows from the `first` on, and of the large bodies the last two of `Travels`."""
+    many, moving = wanted.sum(), shifts.shape[1]
+    part, body, turn = np.empty(many, np.int64), np.empty(many, np.int64), np.empty((many, 9))
+    turning, least = np.zeros(moving, np.bool_), np.empty(moving)
+    k = 0
+    for n in range(len(wanted)):
+        if wanted[n]:
+            part[k], body[k] = first + n, row[first + n] - first
+            frame = frame_of(quaternion[part[k]])
+            for i in range(9):
+                turn[k, i] = frame[i]
+            k += 1
+    for n in range(moving):
+        travel = 0.0
+        for s in range(len(shifts)):
+            x, y, z = shifts[s, n, 0], shifts[s, n, 1], shifts[s, n, 2]
+            travel = max(travel, np.sqrt(x * x + z * z + y * y))
+            turning[n] = turning[n] or shifts[s, n, 3] != 0.0 or shifts[s, n, 4] != 0.0 or shifts[s, n, 5] != 0.0
+        least[n] = max(0.5 * delta, 0.0 if turning[n] else travel)
+    return part, body, turn, turning, least
 
 
 @loop

@@ -98,15 +98,14 @@ class ContactBuffer(NamedTuple):
     def manifold(self, found: int) -> Manifold:
         """The contacts that are filled in."""
         columns = self.out[:found, :3], self.out[:found, 3:6], self.out[:found, 6]
-        touch = Touch(*(np.ascontiguousarray(column) for column in columns))
+        touch = Touch(*map(np.ascontiguousarray, columns))
         return Manifold(self.pair[:found], self.feature[:found], touch)
 
 
 def joined(parts: list[Manifold]) -> Manifold:
     """All contacts of several manifolds of the same pairs."""
     pair, feature, touch = zip(*parts)
-    columns = (np.concatenate(column) for column in zip(*touch))
-    return Manifold(np.concatenate(pair), np.concatenate(feature), Touch(*columns))
+    return Manifold(np.concatenate(pair), np.concatenate(feature), Touch(*map(np.concatenate, zip(*touch))))
 
 
 def manifold(delta: Floats, touches: list[Touch], where: list[Bools] | None = None) -> Manifold:

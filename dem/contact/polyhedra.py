@@ -21,9 +21,11 @@ from typing import NamedTuple
 import numpy as np
 
 from dem.arrays import Floats, Ints
+from dem.bodies import POLYHEDRON
 from dem.compiled import inlined, inner, loop
 from dem.contact.narrow import CORNERS, ContactBuffer, Manifold, Planes, Spheres
 from dem.contact.simplex import CLOSE, ROUND, SNAP, nearer, no_simplex
+from dem.contact.spheres import frame_of
 from dem.geometry.vectors import dot, plus
 from dem.shapes.forms import Form
 from dem.shapes.polyhedra import Faces, Solid, hull
@@ -107,8 +109,22 @@ class Polyhedra(NamedTuple):
 
     def columns(self) -> tuple[Floats, Floats, Floats, Ints]:
         """Without the table of hulls, as loops take them."""
-        center, turn, scale = (np.ascontiguousarray(column) for column in (self.center, self.turn, self.scale))
+        center, turn, scale = map(np.ascontiguousarray, self[:3])
         return center, turn, scale, self.hull
+
+
+@loop
+def frames_of_hulls(kind: Ints, quaternion: Floats, size: Floats, radius: Floats) -> tuple[Floats, Floats, Ints]:
+    """Frames (m, 3, 3), scales (m, 3) and rows (m,) of `Hulls`, of radii (h,), of boxes and polyhedra of these kinds,
+    quaternions and sizes (m, ...)."""
+    turn, scale, hull = np.empty((len(kind), 3, 3)), np.empty((len(kind), 3)), np.empty(len(kind), np.int64)
+    for n in range(len(kind)):
+        hull[n], frame = max(kind[n] - POLYHEDRON + 1, 0), frame_of(quaternion[n])
+        for k in range(9):
+            turn[n, k // 3, k % 3] = frame[k]
+        for k in range(3):
+            scale[n, k] = size[n, 0] / radius[hull[n]] if hull[n] > 0 else size[n, k]
+    return turn, scale, hull
 
 
 def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> Manifold:

@@ -11,7 +11,8 @@ import numpy as np
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
-from dem.contact.ahead import Course, Forms, Poses, hosts_first, seen_from, turn_ahead
+from dem.compiled import inlined, loop
+from dem.contact.ahead import Course, Forms, Poses, guest_is_second, seen_from, turn_ahead
 from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.convex import (
     Solids,
@@ -41,6 +42,7 @@ from dem.contact.narrow import (
 from dem.contact.polyhedra import (
     Hulls,
     Polyhedra,
+    frames_of_hulls,
     hulls_of,
     polyhedra_planes,
     polyhedra_polyhedra,
@@ -75,11 +77,10 @@ class Primitives(NamedTuple):
     supports: Supports  #: of its other convex shapes
     members: Members | None = None  #: the spheres of clumps; None in scenes without
 
-    def take(self, rows: Ints) -> Primitives:
-        """The primitives of these rows, without meshes and clumps."""
-        names = ("number", "row", "kind", "center", "quaternion", "size", "radius")
-        columns = {name: getattr(self, name)[rows] for name in names}
-        return self._replace(**columns, surfaces={}, members=None)
+    def moved(self, rows: Ints, center: Floats, turn: Floats) -> Primitives:
+        """The shapes of these rows (m,) at other centres (m, 3) and quaternions (m, 4), without what else there is of
+        primitives."""
+        return self._replace(kind=self.kind[rows], size=self.size[rows], center=center, quaternion=turn)
 
     def tables(self) -> tuple[Forms, Poses, Floats]:
         """What the loops of `dem.contact.ahead` take of it."""
@@ -87,16 +88,9 @@ class Primitives(NamedTuple):
 
     def now(self, near: Neighbourhood) -> Primitives:
         """The same where the bodies are; parts come from the frames of their bodies."""
-        table, parts = near.bodies, slice(near.grains + near.ghosts, None)
-        row = self.row[parts]
-        turn, plane = table.quaternion[row], (self.kind[parts] == PLANE)[:, None]
-        of_parts = (
-            table.position[row] + quaternion.rotate(turn, self.center[parts]),
-            quaternion.multiply(turn, self.quaternion[parts]),
-            np.where(plane, quaternion.rotate(turn, self.size[parts]), self.size[parts]),
-        )
-        columns = (table.position, table.quaternion, table.size)
-        center, turn, size = (np.concatenate([c[: parts.start], part]) for c, part in zip(columns, of_parts))
+        table, first = near.bodies, near.grains + near.ghosts
+        of_bodies, of_parts = (table.position, table.quaternion, table.size), (self.center, self.quaternion, self.size)
+        center, turn, size = with_parts(first, self.row, self.kind, of_bodies, of_parts)
         return self._replace(center=center, quaternion=turn, size=size)
 
     def of_members(self, i: Ints, j: Ints, reach: Floats) -> tuple[Primitives, Ints, Ints, Floats]:
@@ -122,9 +116,8 @@ class Primitives(NamedTuple):
 
     def polyhedron(self, rows: Any) -> Polyhedra:
         """Boxes are some."""
-        hull, size = np.maximum(self.kind[rows] - POLYHEDRON + 1, 0), self.size[rows]
-        scale = np.where(hull[:, None] > 0, size[:, :1] / self.hulls.radius[hull, None], size)
-        return Polyhedra(self.center[rows], quaternion.matrix(self.quaternion[rows]), scale, hull, self.hulls)
+        given = self.kind[rows], self.quaternion[rows], self.size[rows], self.hulls.radius
+        return Polyhedra(self.center[rows], *frames_of_hulls(*given), self.hulls)
 
     def solid(self, rows: Any) -> Solids:
         """Any convex shape."""
@@ -215,17 +208,15 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
     found = [Manifold(pair, np.zeros(len(pair), np.int64), Touch(point, normal, gap))]
     if not len(others):
         return found[0]
-    i, j, delta = i[others], j[others], delta[others]
-    swap = hosts_first(table.kind[i], table.kind[j])
-    guest, host = np.where(swap, j, i), np.where(swap, i, j)
-    kind = np.where(table.kind >= POLYHEDRON, np.where(table.kind >= CONVEX, _CONVEX, _POLYHEDRON), table.kind)
-    code = 8 * kind[guest] + kind[host]
+    guest, host, swap, code = guests_and_hosts(table.kind, i, j, others)
     for kinds in np.bincount(code).nonzero()[0].tolist():
         if divmod(kinds, 8) in _TOUCH:
             rows = (code == kinds).nonzero()[0]
-            pair, feature, touch = _touching(table, divmod(kinds, 8), guest[rows], host[rows], delta[rows], course)
+            reach = delta[others[rows]]
+            pair, feature, touch = _touching(table, divmod(kinds, 8), guest[rows], host[rows], reach, course)
             touch.normal[swap[rows[pair]]] *= -1.0
             found.append(Manifold(others[rows[pair]], feature, touch))
+    found = [part for part in found if len(part.pair)] or found[:1]
     return joined(found) if len(found) > 1 else found[0]
 
 
@@ -236,7 +227,7 @@ def touches_ahead(
     rows of bodies, so many, are `grains`. A deep gap is no deeper than the pair overlaps at the start, and none is
     wider than `delta` there."""
     found = touches(table, i, j, delta, course)
-    touch = (*found.touch, on_faces(table, i[found.pair], j[found.pair], found, course.moves, grains))
+    touch = (*found.touch, on_faces(table, i, j, found, course.moves, grains))
     given, arcs = (*table.tables(), course[:], i, j, found.pair, touch), np.zeros((0, 4, 3))
     if (table.kind >= CONVEX).any():
         arcs = arcs_of(*given, table.supports[:])
@@ -252,16 +243,17 @@ def touches_ahead(
     return found, moved, swing, linear
 
 
-def on_faces(table: Primitives, one: Ints, two: Ints, found: Manifold, moves: Bools, grains: int) -> Bools:
-    """Which contacts (nc,) of the rows `one` and `two` (nc,) are of round guests on flat faces of hosts that impulses
-    move, by the rows of bodies `moves`. Not of two grains: in beds energy would grow."""
-    kind, flat = table.kind, np.zeros(len(one), np.bool_)
-    if not (faces := moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)).any():
+def on_faces(table: Primitives, i: Ints, j: Ints, found: Manifold, moves: Bools, grains: int) -> Bools:
+    """Which contacts (nc,) of pairs of rows i, j (m,) are of round guests on flat faces of hosts that impulses move, by
+    the rows of bodies `moves`. Grains are no guests: what rests on a bed of them would tremble."""
+    kind, flat = table.kind, np.zeros(len(found.pair), np.bool_)
+    is_round = (kind == SPHERE) | (kind == CAPSULE) | (kind >= CONVEX)
+    guests = is_round & (table.row >= grains)
+    if not guests.any():
         return flat
-    swap = hosts_first(kind[one], kind[two])
-    guest, host = np.where(swap, two, one), np.where(swap, one, two)
-    is_round = (kind[guest] == SPHERE) | (kind[guest] == CAPSULE) | (kind[guest] >= CONVEX)
-    rows = np.flatnonzero(faces[host] & is_round & (table.row[two] >= grains))  # large bodies are the second ones
+    guest, host, swap, _ = guests_and_hosts(kind, i, j, found.pair)
+    faces = moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)
+    rows = np.flatnonzero(faces[host] & guests[guest])
     away = found.touch.normal * np.where(swap, 1.0, -1.0)[:, None]
     flat[rows[kind[host[rows]] == PLANE]] = True
     for row in table.surfaces:
@@ -277,10 +269,11 @@ def _touching(
 ) -> Manifold:
     """The contacts of pairs of rows i, j (m,) of two kinds; with meshes mesh by mesh."""
     contacts, first, second = _TOUCH[kinds]
-    guests = table.take(i)
-    if course is not None:
+    if course is None:
+        guests = table.moved(i, table.center[i], table.quaternion[i])
+    else:
         center, turn, travel = seen_from(*table.tables(), course[:], i, j)
-        guests, delta = guests._replace(center=center, quaternion=turn), delta + travel
+        guests, delta = table.moved(i, center, turn), delta + travel
     further = (table.hulls,) if first is Primitives.solid or second is Primitives.solid else ()
     if second is not None:
         return contacts(first(guests, slice(None)), second(table, j), delta, *further)
@@ -292,8 +285,61 @@ def _touching(
     return joined(found)
 
 
+@loop
+def with_parts(first, row, kind, bodies, parts):
+    """Centres (n, 3), quaternions (n, 4) and sizes (n, 3) of shapes, of which those before the `first` part are the
+    `bodies` in the same rows; each of the `parts`, which are in the frames of the bodies in their `row` (n,), goes with
+    its body, and the normals of half spaces turn."""
+    (position, turns, sizes), (offset, turned, extent) = bodies, parts
+    center, turn, size = np.empty(offset.shape), np.empty(turned.shape), np.empty(extent.shape)
+    center[:first], turn[:first], size[:first] = position[:first], turns[:first], sizes[:first]
+    for n in range(first, len(row)):
+        p, q = turns[row[n]], turned[n]
+        moved, sized = rotated(p, offset[n]), rotated(p, extent[n])
+        for k in range(3):
+            center[n, k] = position[row[n], k] + moved[k]
+            size[n, k] = sized[k] if kind[n] == PLANE else extent[n, k]
+        turn[n, 0] = p[0] * q[0] - (p[1] * q[1] + p[2] * q[2] + p[3] * q[3])
+        turn[n, 1] = p[0] * q[1] + q[0] * p[1] + (p[2] * q[3] - p[3] * q[2])
+        turn[n, 2] = p[0] * q[2] + q[0] * p[2] + (p[3] * q[1] - p[1] * q[3])
+        turn[n, 3] = p[0] * q[3] + q[0] * p[3] + (p[1] * q[2] - p[2] * q[1])
+    return center, turn, size
+
+
+@inlined
+def rotated(q, v):
+    """A vector turned by a quaternion."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    a, b, c = y * v[2] - z * v[1], z * v[0] - x * v[2], x * v[1] - y * v[0]
+    return (
+        v[0] + 2.0 * (w * a + (y * c - z * b)),
+        v[1] + 2.0 * (w * b + (z * a - x * c)),
+        v[2] + 2.0 * (w * c + (x * b - y * a)),
+    )
+
+
+@loop
+def guests_and_hosts(kind, i, j, pairs):
+    """Of some of the pairs of rows i, j of the shapes, by their numbers `pairs` (m,), the guests and the hosts (m,),
+    whether the second one is the guest, and 8 times the kind of the guest, as in `_TOUCH`, and that of the host."""
+    guest, host = np.empty(len(pairs), np.int64), np.empty(len(pairs), np.int64)
+    swap, code = np.empty(len(pairs), np.bool_), np.empty(len(pairs), np.int64)
+    for n in range(len(pairs)):
+        a, b = i[pairs[n]], j[pairs[n]]
+        swap[n] = guest_is_second(kind[a], kind[b])
+        guest[n], host[n] = (b, a) if swap[n] else (a, b)
+        code[n] = 8 * kind_in_pairs(kind[guest[n]]) + kind_in_pairs(kind[host[n]])
+    return guest, host, swap, code
+
+
 #: The kinds of polyhedra that are no boxes, and of other convex shapes, in pairs: clumps are their spheres there.
 _POLYHEDRON, _CONVEX = CLUMP, CLUMP + 1
+
+
+@inlined
+def kind_in_pairs(kind):
+    return _CONVEX if kind >= CONVEX else _POLYHEDRON if kind >= POLYHEDRON else kind
+
 
 #: For pairs of kinds, of guest and host (`dem.contact.ahead.RANK`), the contacts, and what these take of each of the
 #: two; None: mesh by mesh.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +12,6 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Bools, Floats, Ints, Keys, places
 from dem.bodies import CAPSULE, CLUMP, FORM, MESH, POLYHEDRON, SPHERE
-from dem.checks import not_negative
 from dem.compiled import loop
 from dem.contact.ahead import Course
 from dem.contact.candidates import Pairs, meeting
@@ -72,7 +73,7 @@ class Contacts:
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row per contact by name, without copies."""
-        left = {"near", "shifts", "owned", "lists", "lag", "held_overlap"}
+        left = {"near", "shifts", "owned", "lists", "lag", "held_overlap", "frame"}
         left |= {name for name in ("moved", "linear", "swing", "drift", "parting") if getattr(self, name) is None}
         return {name: value for name, value in vars(self).items() if name not in left}
 
@@ -80,6 +81,11 @@ class Contacts:
     def linear_gap(self) -> Floats:
         """The gaps (nc,) to which the normal velocities of a step times dt are added [m]."""
         return self.gap if self.linear is None else self.linear
+
+    @cached_property
+    def frame(self) -> Floats:
+        """The `contact_frames` (nc, 3, 3) of the normals."""
+        return contact_frames(self.normal)
 
     def branch(self, position: Floats) -> Floats:
         """From the centre of body a to that of body b, or of its image (nc, 3), at these positions (rows, 3) [m]."""
@@ -99,6 +105,29 @@ class Contacts:
         return replace(self, **{name: column[rows] for name, column in self.columns().items()})
 
 
+def contact_frames(normal: Floats) -> Floats:
+    """Return orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
+
+    Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
+    but where the sign of its z component changes.
+    """
+    return _frames(normal).reshape(-1, 3, 3)
+
+
+@loop
+def _frames(normal: Floats) -> Floats:
+    out = np.empty((len(normal), 9))
+    for c in range(len(normal)):
+        x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
+        sign = np.copysign(1.0, z)
+        p = -1.0 / (sign + z)
+        q = x * y * p
+        out[c, 0], out[c, 1], out[c, 2] = x, y, z
+        out[c, 3], out[c, 4], out[c, 5] = 1.0 + sign * x * x * p, sign * q, -sign * x
+        out[c, 6], out[c, 7], out[c, 8] = q, sign + y * y * p, -y
+    return out
+
+
 def find_contacts(
     world: World, delta: float, free: UnconstrainedMotion | None = None, margin: Floats | float = 0.0,
     shifts: Floats | None = None, lists: Lists | None = None, besides: Contacts | None = None,
@@ -113,7 +142,8 @@ def find_contacts(
     lower global index. `lists`: those of an earlier search that may hold; None: those of the world. With `besides`,
     contacts that a search with margins not greater has found, only those are found that are not among them.
     """
-    not_negative("contact distance delta", delta)
+    if not 0.0 <= delta < math.inf:
+        raise ValueError(f"contact distance delta must not be negative, got {delta:g}")
     margin, travel, shifts = _margins(world, delta, free, margin, shifts)
     refuse_short(world, margin)
     lists = grain_lists(world, world.lists if lists is None else lists, margin, travel)
@@ -151,7 +181,7 @@ def _margins(
 def _that_touch(world: World, near: Neighbourhood, table: Primitives, pairs: Pairs) -> Pairs:
     """The pairs of materials that touch each other, and of bodies that are not `World.apart`."""
     i, j, reach = pairs
-    if not world.pairs.touching.all():
+    if not world.pairs.all_touch:
         material = near.bodies.material[table.row]
         touch = world.pairs.touching[material[i], material[j]] > 0.0
         i, j, reach = i[touch], j[touch], reach[touch]
@@ -301,9 +331,9 @@ def _order(foreign, a, b, key):
 def exceeds_margin(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
     """Return whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as
     in one of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
-    free = bodies.is_dynamic(world.large)
-    if not free.any():
+    if not world.large_moves:
         return False
+    free = bodies.is_dynamic(world.large)
     size = extents([body.shapes for body in world.large_bodies])[free]
 
     def distance(shift: Floats) -> Floats:
@@ -346,10 +376,12 @@ def _without_rigid(world: World, contacts: Contacts) -> Contacts:
 
     Their normals are across the free directions of a body, and they do not turn it about a free axis, and the other
     body is held too. Their normal impulse changes no velocity, and would allow any friction."""
+    if not world.large_moves:
+        return contacts
     near, moves = contacts.near, bodies.is_dynamic(world.large)[:, None, None]
     first = near.grains + near.ghosts
     rigid = np.minimum(contacts.a, contacts.b) >= first
-    if not (moves.any() and rigid.any()):
+    if not rigid.any():
         return contacts
     these = contacts.take(rigid)
     free, turns = free_directions(world.large_bodies) * moves, free_turns(world.large_bodies) * moves

@@ -28,16 +28,18 @@ class Halo:
     own : number of own bodies
     rows : number of rows of a table
     ghosts : (n,) rows of the ghosts, in the order of their owners
+    talks : whether this rank shares ghosts with others
     """
 
     def __init__(self, comm: MPI.Comm, own: int, rows: int, ghosts: Ints, owner: np.ndarray, place: Ints):
         """Ghosts in the rows ``ghosts`` (n,) are copies of the rows ``place`` (n,) of the ranks ``owner`` (n,);
         collective."""
         self.comm, self.own, self.rows = comm, own, rows
-        self.ghosts = ghosts[np.argsort(owner, kind="stable")]
+        self.ghosts = ghosts[owner.argsort(kind="stable")]
         asked = exchange(comm, {"row": place, "rank": np.full(len(place), comm.rank)}, owner)
         self._shared = asked["row"]  # own rows that are ghosts elsewhere, by rank
         self._owners, self._holders = _pieces(owner), _pieces(asked["rank"])
+        self.talks = bool(self._owners or self._holders)
         self._messages: dict[tuple, Messages] = {}
         self._open: Messages | None = None
 
@@ -59,24 +61,26 @@ class Halo:
 
     def begin_update(self, values: np.ndarray) -> None:
         """Owners may change their values after this, and read those of ghosts after `end_update`."""
-        self._send(values, self._shared, self.ghosts, self._holders, self._owners)
+        if self.talks:
+            self._send(values, self._shared, self.ghosts, self._holders, self._owners)
 
     def end_update(self, values: np.ndarray) -> None:
-        for rows, arrived in self._wait():
-            _put(arrived, rows, _flat(values))
+        if self.talks:
+            for rows, arrived in self._wait():
+                _put(arrived, rows, _flat(values))
 
     def begin_add(self, values: np.ndarray) -> None:
         """Owners may still change their own values until `end_add`."""
-        self._send(values, self.ghosts, self._shared, self._owners, self._holders)
+        if self.talks:
+            self._send(values, self.ghosts, self._shared, self._owners, self._holders)
 
     def end_add(self, values: np.ndarray) -> None:
-        for rows, arrived in self._wait():  # in the order of the ranks, so that sums repeat themselves
-            _add(arrived, rows, _flat(values))
+        if self.talks:
+            for rows, arrived in self._wait():  # in the order of the ranks, so that sums repeat themselves
+                _add(arrived, rows, _flat(values))
 
     def _send(self, values: np.ndarray, rows: Ints, changed: Ints, to: Pieces, by: Pieces) -> None:
         """Begin to send ``rows`` of the values to some ranks; the rows ``changed`` are those of what others send."""
-        if not (to or by):
-            return
         kind = (rows is self.ghosts, values.shape[1:], values.dtype)
         if kind not in self._messages:
             self._messages[kind] = Messages(self.comm, kind, rows, changed, to, by)

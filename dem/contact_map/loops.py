@@ -93,17 +93,31 @@ def closing(frame, arm, body, w) -> tuple[Floats, Floats]:
 
 @loop
 def works(frame, arm, body, g, w, new_w):
-    """g' D' (w + new_w) / 2 of normal and of tangential impulses g (nc, 3), and the normal part (nc,) of D' new_w."""
-    normal, tangential, velocity = 0.0, 0.0, np.empty(len(body))
+    """g' D' (w + new_w) / 2 of normal and of tangential impulses g (nc, 3), and the normal parts (nc,) of D' w and
+    D' new_w."""
+    normal, tangential, last, velocity = 0.0, 0.0, np.empty(len(body)), np.empty(len(body))
     for c in range(len(body)):
         u0, u1, u2 = velocity_at(c, arm, body, w)
         v0, v1, v2 = velocity_at(c, arm, body, new_w)
+        last[c] = frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2
         velocity[c] = frame[c, 0] * v0 + frame[c, 1] * v1 + frame[c, 2] * v2
         u0, u1, u2 = 0.5 * (u0 + v0), 0.5 * (u1 + v1), 0.5 * (u2 + v2)
         normal += g[c, 0] * (frame[c, 0] * u0 + frame[c, 1] * u1 + frame[c, 2] * u2)
         tangential += g[c, 1] * (frame[c, 3] * u0 + frame[c, 4] * u1 + frame[c, 5] * u2)
         tangential += g[c, 2] * (frame[c, 6] * u0 + frame[c, 7] * u1 + frame[c, 8] * u2)
-    return normal, tangential, velocity
+    return normal, tangential, last, velocity
+
+
+@loop
+def add_momenta_on(first, frame, arm, body, g, m):
+    """m += D g for impulses g (nc, 3) of the contacts whose second body is in the row `first` or behind it."""
+    for c in range(len(body)):
+        if body[c, 1] >= first:
+            g0, g1, g2 = g[c, 0], g[c, 1], g[c, 2]
+            f0 = frame[c, 0] * g0 + frame[c, 3] * g1 + frame[c, 6] * g2
+            f1 = frame[c, 1] * g0 + frame[c, 4] * g1 + frame[c, 7] * g2
+            f2 = frame[c, 2] * g0 + frame[c, 5] * g1 + frame[c, 8] * g2
+            push(c, arm, body, f0, f1, f2, m)
 
 
 @loop

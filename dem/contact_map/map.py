@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -59,9 +58,11 @@ class ContactMap:
         self._arrays = self._floats(given.frame), self._floats(given.arm), body
         self._w, self._m = np.zeros((2, halo.rows, 6), precision)
         self._pushed = np.zeros(self.mass.axes)  # by the impulses that were collected last, on this rank
-        ghost = np.zeros(halo.rows, bool)
-        ghost[halo.ghosts] = True
-        self._first_away = first_touching(body, ghost) if len(halo.ghosts) else self.rows
+        self._first_away = self.rows
+        if len(halo.ghosts):
+            ghost = np.zeros(halo.rows, bool)
+            ghost[halo.ghosts] = True
+            self._first_away = first_touching(body, ghost)
         self._set_parts()
         self._flops = 45 * self.rows + 6 * self.columns
 
@@ -95,10 +96,8 @@ class ContactMap:
         """y += G G' g; y (nc, 3) is C-contiguous."""
         y = shaped("velocities of contacts", y, self.rows, 3)
         self._collect(g, self._m)
-        shared = self._share(self._m)
         loops.scale(self.mass.unshared, self._m, self._w)
-        self._send(shared)
-        self._set_velocities(y, y, self.mass.rates(shared))
+        self._set_velocities(y, y, self._send(self._share(self._m) if self.mass.shared else None))
         self.log_flops(2 * self._flops)
 
     def shared(self, g: Floats) -> Floats:
@@ -132,8 +131,8 @@ class ContactMap:
         self._away = [self._part(self._first_away, self.rows)] if self._first_away < self.rows else []
 
     def _part(self, begin: int, end: int) -> tuple[Any, ...]:
-        here = slice(begin, end)
-        return (here, *(array[here] for array in self._arrays))
+        here, (frame, arm, body) = slice(begin, end), self._arrays
+        return here, frame[here], arm[here], body[here]
 
     def image(self) -> Floats:
         """Memory for an image: momenta (halo.rows, 6), and the shared coordinates (mass.shared, 6)."""
@@ -141,17 +140,19 @@ class ContactMap:
 
     def find_image(self, x: Floats, image: Floats) -> None:
         """image = D x for impulses x (nc, 3)."""
-        count = self.halo.rows
+        count, mass = self.halo.rows, self.mass
         self._push(x, image[:count])
-        self.mass.share(image[:count], self._pushed, image[count:])
+        if mass.shared:
+            mass.share(image[:count], self._pushed, image[count:])
         self.log_flops(self._flops)
 
     def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats) -> None:
         """y = before + G G' z (nc, 3) for the z whose image is image + beta (image - last)."""
-        shared = self._shared_at(image, last, beta)
-        loops.scale_extrapolated(self.mass.unshared, image, last, beta, self._w)
-        self._send(shared)
-        self._set_velocities(before, y, self.mass.rates(shared))
+        mass, shared = self.mass, None
+        loops.scale_extrapolated(mass.unshared, image, last, beta, self._w)
+        if mass.shared:
+            shared = self._shared_at(image, last, beta)
+        self._set_velocities(before, y, self._send(shared))
         self.log_flops(self._flops + 12 * self.columns)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
@@ -164,7 +165,7 @@ class ContactMap:
     def _shared_at(self, image: Floats, last: Floats, beta: float) -> Floats:
         """The shared coordinates (mass.shared, 6) of z."""
         now, before = image[self.halo.rows :], last[self.halo.rows :]
-        return now + self.precision(beta) * (now - before) if self.mass.shared else now
+        return now + self.precision(beta) * (now - before)
 
     def weights(self, H: Floats, symmetric: bool = True) -> Floats:
         """Blocks H (nc, 3, 3) in the format of `through`: (nc, 6), or (nc, 9) if they are not symmetric."""
@@ -207,17 +208,16 @@ class ContactMap:
         """D' v (nc, 3) for the velocities (rows, 6) of all rows of a table of the halo, without a message."""
         return loops.relative_velocities(*self._arrays, v)
 
-    def works(self, g: Floats, v: Floats, new_v: Floats) -> tuple[float, float, Floats]:
+    def works(self, g: Floats, v: Floats, new_v: Floats) -> tuple[float, float, Floats, Floats]:
         """The work of normal and of tangential impulses g (nc, 3) on the mean of two velocities (rows, 6) of all rows
-        of a table of the halo, and the normal velocities (nc,) of the second, without a message."""
+        of a table of the halo, and the normal velocities (nc,) of both, without a message."""
         return loops.works(*self._arrays, g, v, new_v)
 
-    def sums_of_impulses(self, g: Floats, contacts: Ints) -> Floats:
-        """D g (rows, 6) of these of this rank's contacts, by rows of a table of the halo, without a message."""
+    def sums_of_impulses(self, g: Floats, first: int = 0) -> Floats:
+        """D g (rows, 6) of those of this rank's contacts whose second body is in the row `first` or behind it, by rows
+        of a table of the halo, without a message."""
         sums = np.zeros((self.halo.rows, 6))
-        g = self._floats(shaped("impulses", g, self.rows, 3))
-        frame, arm, body = self._arrays
-        loops.add_momenta(frame[contacts], arm[contacts], body[contacts], g[contacts], sums, np.zeros(0))
+        loops.add_momenta_on(first, *self._arrays, self._floats(shaped("impulses", g, self.rows, 3)), sums)
         return sums
 
     def _enter(self, v: Floats) -> None:
@@ -234,16 +234,23 @@ class ContactMap:
         self.mass.share(m, self._pushed, shared)
         return shared
 
-    def _send(self, shared: Floats) -> None:
-        """Add the velocities by shared coordinates to those of the own bodies, and begin to send them as `_enter`."""
-        self.mass.add_bodies(shared, self._w)
-        self.halo.begin_update(self._w)
+    def _send(self, shared: Floats | None) -> Floats:
+        """Add the velocities by shared coordinates, if there are any, to those of the own bodies, and begin to send
+        them as `_enter`; returns the rates (axes,) of a cell."""
+        rates, mass = self.mass.none, self.mass
+        if shared is not None:
+            mass.add_bodies(shared, self._w)
+            rates = mass.rates(shared)
+        if self.halo.talks:
+            self.halo.begin_update(self._w)
+        return rates
 
     def _set_velocities(self, before: Floats, y: Floats, rate: Floats) -> None:
         """y = before + D' w (nc, 3), with the velocities w that are on their way, and the rates of a cell."""
         here, frame, arm, body = self._own
         loops.set_velocities(frame, arm, body, before[here], y[here], self._w, rate)
-        self.halo.end_update(self._w)
+        if self.halo.talks:
+            self.halo.end_update(self._w)
         for here, frame, arm, body in self._away:
             loops.set_velocities(frame, arm, body, before[here], y[here], self._w, rate)
 
@@ -263,10 +270,12 @@ class ContactMap:
         m[:] = 0.0
         for here, frame, arm, body in self._away:
             loops.add_momenta(frame, arm, body, g[here], m, self._pushed)
-        self.halo.begin_add(m)
-        here, frame, arm, body = self._own
+        halo, (here, frame, arm, body) = self.halo, self._own
+        if halo.talks:
+            halo.begin_add(m)
         loops.add_momenta(frame, arm, body, g[here], m, self._pushed)
-        self.halo.end_add(m)
+        if halo.talks:
+            halo.end_add(m)
 
     def _sum_forces(self, m: Floats) -> None:
         """m = the momenta of the bodies by the impulses in ``_forces``, on several threads."""
@@ -323,7 +332,9 @@ class ContactMap:
         frame = np.empty((self.rows, 9), precision)
         loops.scale_frames(self.source.frame, size, frame)
         mass = self.mass.rounded(precision)
-        other = ContactMap(self.comm, replace(self.source, frame=frame), self.halo, self.body, precision, mass)
+        given = self.source
+        rows = CompactRows(frame, given.arm, given.body, given.root, given.columns)
+        other = ContactMap(self.comm, rows, self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
         if threads() > 1:
             other._ends = self._ends

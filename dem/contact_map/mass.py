@@ -34,16 +34,19 @@ class InverseMass:
 
     def __init__(self, root: Floats, precision: type[np.floating] = np.float64):
         self.precision = precision
-        self.root, self.square = (np.ascontiguousarray(x, dtype=precision) for x in (root, squared(root)))
+        self.root = np.ascontiguousarray(root, dtype=precision)
+        self.square = np.ascontiguousarray(squared(root), dtype=precision)
         self.unshared = self.square  #: M^-1 of the bodies that are in no shared coordinate, else zero
-        self._none = np.zeros(0, precision)
+        self.none = np.zeros(0, precision)  #: the rates of no cell
 
     def rounded(self: Mass, precision: type[np.floating]) -> Mass:
         """The same in this precision."""
+        if precision is self.precision:
+            return self
         other = copy.copy(self)
         tables = (np.ascontiguousarray(x, dtype=precision) for x in (self.root, self.square, self.unshared))
         other.precision, (other.root, other.square, other.unshared) = precision, tables
-        other._none = np.zeros(0, precision)
+        other.none = np.zeros(0, precision)
         return other
 
     def scale(self, v: Floats, out: Floats) -> None:
@@ -65,16 +68,16 @@ class InverseMass:
 
     def rates(self, s: Floats) -> Floats:
         """The rates (axes,) of a cell by s."""
-        return self._none
+        return self.none
 
     def rates_of(self, v: Floats) -> Floats:
         """The rates (axes,) of mass-scaled velocities v (columns, 6); collective."""
-        return self._none
+        return self.none
 
     @property
     def mobility(self) -> Floats:
         """That of the rates (axes,)."""
-        return self._none
+        return self.none
 
     def energy(self, s: Floats) -> float:
         """s' M^-1 s, on one rank."""

@@ -5,8 +5,8 @@ A contact belongs to the rank of the lower global body index: ghosts only travel
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -73,11 +73,12 @@ def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> 
         np.concatenate(own, axis=1, out=moved[:grains])
         halo.update(moved)
         ghosts = moved[grains:]
-    columns: dict[str, Any] = {
+    columns = {
         name: np.concatenate([getattr(world.grains, name), ghosts[:, part], getattr(world.large, name)])
         for name, part in (("position", slice(3)), ("quaternion", slice(3, 7)), ("velocity", slice(7, 13)))
     }
-    return replace(near, bodies=replace(near.bodies, **columns), margin=np.concatenate([margin, ghosts[:, 13]]))
+    table = Bodies(**(vars(near.bodies) | columns))
+    return Neighbourhood(table, np.concatenate([margin, ghosts[:, 13]]), near.index, grains, near.ghosts)
 
 
 def chunk_boxes(position: Floats, radius: Floats, count: int) -> Floats:

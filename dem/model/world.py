@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +11,7 @@ from mpi4py import MPI
 from dem import bodies
 from dem.arrays import Floats, Ints, Keys
 from dem.bodies import Bodies
-from dem.motion import Dynamic, Pose, checked_pose
+from dem.motion import Dynamic, Pose
 from dem.parts.cell import OPEN, Cell
 from dem.parts.contact_law import ContactLaw
 from dem.parts.passages import Passages
@@ -22,7 +21,8 @@ from dem.together import together
 
 #: The fields of a world that a step changes; what these refer to is replaced, and never changed in place.
 STATE = (
-    "grains", "large", "slabs", "only_spheres", "lists", "memory", "cell", "passages", "time", "step", "spare",
+    "grains", "large", "slabs", "only_spheres", "any_spheres", "lists", "memory", "cell", "passages", "time", "step",
+    "spare",
 )  # fmt: skip
 
 
@@ -56,6 +56,8 @@ class World:
     spare: float = 3000.0  #: iterations that steps at rest may spend beyond the limits of the solver, `pctt.run.rest`
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
+    any_spheres: bool = field(init=False)  #: whether any is one
+    large_moves: bool = field(init=False)  #: whether forces move any large body
 
     #: Kinds and names of the parts and large bodies that a run has changed by `dem.model.changes.change`.
     changed: set[tuple[str, str]] = field(init=False, default_factory=set)
@@ -67,10 +69,16 @@ class World:
 
     def __post_init__(self) -> None:
         self.set_grains(self.grains)
+        self._set_large(self.large_bodies)
+
+    def _set_large(self, large_bodies: tuple[LargeBody, ...]) -> None:
+        self.large_bodies = large_bodies
+        self.large_moves = any(isinstance(body.motion, Dynamic) for body in large_bodies)
 
     def trial(self) -> World:
         """A world that a step may change: this one stays as it is until it takes its state."""
-        other = copy(self)
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
         other.grains, other.large = self.grains.copy(), self.large.copy()
         return other
 
@@ -90,10 +98,10 @@ class World:
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
         self.grains, self.lists = grains, None
-        everyone = np.zeros((self.comm.size + 1, 2), np.int64)
-        self.comm.Allgather(np.array([len(grains), (grains.shape != bodies.SPHERE).any()], np.int64), everyone[1:])
+        everyone, balls = np.zeros((self.comm.size + 1, 2), np.int64), np.count_nonzero(grains.shape == bodies.SPHERE)
+        self.comm.Allgather(np.array([len(grains), balls], np.int64), everyone[1:])
         self.slabs = np.cumsum(everyone[:, 0])
-        self.only_spheres = not everyone[:, 1].any()
+        self.only_spheres, self.any_spheres = bool((everyone[:, 0] == everyone[:, 1]).all()), bool(everyone[:, 1].any())
 
     @property
     def ids(self) -> int:
@@ -116,7 +124,7 @@ class World:
     @property
     def turns_unlike_spheres(self) -> bool:
         """Whether a body that turns freely may do so in another way than a sphere; the same on all ranks."""
-        return not self.only_spheres or bool(np.isfinite(self.large.inertia).all(axis=1).any())
+        return not self.only_spheres or (self.large_moves and bool(np.isfinite(self.large.inertia).all(axis=1).any()))
 
     def large_row(self, name: str) -> int:
         """Row of a large body in `large`; KeyError if there is none of that name."""
@@ -133,14 +141,14 @@ class World:
     def replace_large(self, body: LargeBody) -> None:
         """Put this large body in the place of that of its name; the same on all ranks."""
         row = self.large_row(body.name)
-        self.large_bodies = (*self.large_bodies[:row], body, *self.large_bodies[row + 1 :])
+        self._set_large((*self.large_bodies[:row], body, *self.large_bodies[row + 1 :]))
         self.changed.add(("body", body.name))
 
     def poses(self, time: float) -> dict[int, Pose]:
         """Places (3,) and quaternions (4,) of the large bodies of prescribed motion at `time` [s], by row; collective.
         SceneError if a motion fails."""
         return together(self.comm, "motion of a large body", lambda: {
-            row: checked_pose(body.motion, time, body.position, body.quaternion)
+            row: body.pose(time)
             for row, body in enumerate(self.large_bodies) if not isinstance(body.motion, Dynamic)
         })  # fmt: skip
 

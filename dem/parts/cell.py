@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 from typing import Any, ClassVar
 
@@ -45,12 +46,12 @@ class Cell(Named):
     rate: Floats = _three(0.0)  #: (3,) of the periods in the last step, over them [1/s]
     CHANGED: ClassVar = ("shear_rate", "stress", "strain_rate")
 
-    @property
+    @cached_property
     def axes(self) -> Bools:
         """Mask (3,) of the axes along which the cell repeats itself."""
         return np.isfinite(self.period)
 
-    @property
+    @cached_property
     def periodic(self) -> bool:
         return bool(self.axes.any())
 
@@ -182,17 +183,18 @@ class Cell(Named):
 
     def beside_flow(self, position: Floats, velocity: Floats) -> Floats:
         """Velocities (n, 3 or 6) beside those of the shear at these positions (n, 3)."""
+        if self.gradient is None:
+            return velocity
         beside = velocity.copy()
-        if self.gradient is not None:
-            beside[:, 0] -= self.shear_rate * position[:, self.gradient]
+        beside[:, 0] -= self.shear_rate * position[:, self.gradient]
         return beside
 
     def margin(self, dt: float, grains: Bodies) -> Floats | float:
         """What the margins (n,) of grains have beside their ways in dt [s]: the share of a grain in the way by which
         the shear, and the cell as it changes its size, bring the centres of a pair together [m]."""
-        strain = dt * (abs(self.shear_rate) + float(np.abs(self.rate).max()))
-        if not strain:
+        if not self.moves:
             return 0.0
+        strain = dt * (abs(self.shear_rate) + float(np.abs(self.rate).max()))
         return strain * 3.0 * bodies.bounding_radius(grains)  # with a margin of two radii, the greatest there is
 
     def strained_since(self, then: Cell) -> tuple[Floats, float]:

@@ -58,6 +58,16 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
         return any(law.RESISTS for law in self.acting)
 
     @cached_property
+    def bounces(self) -> bool:
+        """Whether bodies of any pair bounce."""
+        return bool(self.restitution.any())
+
+    @cached_property
+    def all_touch(self) -> bool:
+        """Whether bodies of all pairs touch each other."""
+        return bool(self.touching.all())
+
+    @cached_property
     def attracts(self) -> bool:
         """Whether bodies of any pair attract each other."""
         return bool(self.strongest(np.ones(1)) > 0.0)

@@ -62,6 +62,8 @@ class Passages:
 
     def counted(self, sources: dict[str, Source] | None = None) -> Passages:
         """The same with other tallies, which are as these, and with a world's own `sources`."""
+        if sources is None and not self.tallies:
+            return self
         tallies = {name: replace(self.tallies.get(name, Tally())) for name in self.names}
         return Passages(self.sources if sources is None else sources, dict(self.outlets), tallies)
 

@@ -6,7 +6,8 @@ All functions are collective, and their results are the same on all ranks and, t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,12 +15,12 @@ from mpi4py import MPI
 
 from dem import bodies
 from dem.arrays import ArrayLike, Bools, Floats, Ints
-from dem.bodies import COMPOUND, Bodies
+from dem.bodies import COMPOUND, Bodies, radius_about
 from dem.compiled import loop
 from dem.exchange import broadcast, reduced
 from dem.experiment import Experiment
 from dem.motion import Held
-from dem.record.energies import energy
+from dem.record.energies import add_kinetic
 from dem.start import stiffness
 from dem.step.servo import cell_stress
 from dem.together import SceneError, digest, together
@@ -38,10 +39,14 @@ def row(step: Step, scene: Experiment) -> dict[str, float]:
     if scene.domain is not None:
         out["grains_outside"] = outside(step, *scene.domain)
     for body in step.world.large_bodies:
-        force = step.force_on(body.name)
-        out |= {f"force_{body.name}_{axis} [N]": force[k] for k, axis in enumerate("xyz")}
-        out |= {f"torque_{body.name}_{axis} [N m]": force[3 + k] for k, axis in enumerate("xyz")}
+        out.update(zip(_names_of_forces(body.name), step.force_on(body.name).tolist()))
     return out | _own(step, scene, out)
+
+
+@lru_cache(maxsize=1024)
+def _names_of_forces(name: str) -> list[str]:
+    """Those of a large body in a row."""
+    return [f"{what}_{name}_{k} [{unit}]" for what, unit in (("force", "N"), ("torque", "N m")) for k in "xyz"]
 
 
 def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str, float]:
@@ -123,33 +128,28 @@ def energy_balance(step: Step) -> dict[str, float]:
     """
     world, near, comm, system = step.world, step.contacts.near, step.world.comm, step.system
     first, moves = near.grains + near.ghosts, bodies.is_dynamic(world.large)
-    before = near.bodies.take(slice(0, near.grains)), near.bodies.take(slice(first, None))
-    after, own = (world.grains, world.large), 1 if comm.rank else 2  # the large bodies count once
-    was, now = (_each(energy(table, world.gravity) for table in tables[:own]) for tables in (before, after))
-    still, least = _each(_still(table, world.gravity, system.dt) for table in after[:own])
+    own = 1 if comm.rank else 2  # the large bodies count once
+    tables = ((world.grains, slice(near.grains)), (world.large, slice(first, None)))[:own]
+    of_bodies = map(sum, zip(*(_ledger(step, table, rows) for table, rows in tables)))
     velocity = near.bodies.velocity.copy()
     velocity[first:][~moves] = world.large.velocity[~moves]
     mean = 0.5 * (velocity[first:] + world.large.velocity)
-    normal, tangential, opening = works(step, step.in_cone, velocity, step.moment)
-    elastic, elastic_at_end, strained, strained_at_end = elastic_energies(step, velocity, opening)
+    normal, tangential, came, opening = works(step, step.in_cone, velocity, step.moment)
+    of_springs = elastic_energies(step, came, opening)
     attracted = 0.0 if system.attraction is None else works(step, step.impulse, velocity)[0] - normal
     applied = belts = flow = 0.0
     if system.applied is not None:
-        applied = 0.5 * np.vdot(system.applied.grains, before[0].velocity + world.grains.velocity)
+        applied = 0.5 * np.vdot(system.applied.grains, near.bodies.velocity[: near.grains] + world.grains.velocity)
     if system.surface is not None:
         belts = -np.vdot(step.impulse[:, 1:], system.surface)
     if system.drift is not None:
         flow = -np.vdot(step.impulse, system.drift)
-    momenta = sum(_momentum(table) for table in (*before[:own], *after[:own]))
-    falling = 0.5 * system.dt * float(world.gravity @ momenta)
-    whole = _summed(
-        comm, kinetic_before=was[0], potential_before=was[1], kinetic=now[0], potential=now[1], falling=falling,
-        normal=normal, tangential=tangential, elastic=elastic, elastic_at_end=elastic_at_end, strained=strained,
-        strained_at_end=strained_at_end, still=still, least=least, carried=_carried(step, ~moves), attracted=attracted,
-        applied=applied, belts=belts, flow=flow, bounced=_bounced_work(step),
-    )  # fmt: skip
+    whole = dict(zip(WHOLE, reduced(comm, (
+        *of_bodies, *of_springs, normal, tangential, _carried(step, ~moves), attracted, applied, belts, flow,
+        _bounced_work(step),
+    ), ())[0]))  # fmt: skip
     holding = _holding_work(step, near.bodies.velocity[first:], mean)
-    held_by, held_at_end = _constraint_works(step, before[0].velocity, mean)
+    held_by, held_at_end = _constraint_works(step, near.bodies.velocity[: near.grains], mean)
     driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + (whole["applied"] + whole["flow"])
     driving = driving + whole["belts"] + (holding + held_by)
     work = driving - np.vdot(step.impulse_on_large[~moves], mean[~moves])
@@ -187,83 +187,82 @@ def _bounced_work(step: Step) -> float:
     return 0.0 if applied is None or lag is None else float(np.vdot(applied.grains[:, :3], lag)) / step.system.dt
 
 
-def _each(pairs: Iterable[tuple[float, float]]) -> tuple[float, float]:
-    """The sums of the first and of the second numbers of pairs."""
-    first, second = zip(*pairs)
-    return sum(first), sum(second)
+#: What `energy_balance` adds up over the ranks: what `_ledger` returns, `elastic_energies`, and the works.
+WHOLE = (
+    "kinetic_before", "potential_before", "kinetic", "potential", "falling", "still", "least", "elastic",
+    "elastic_at_end", "strained", "strained_at_end", "normal", "tangential", "carried", "attracted", "applied", "belts",
+    "flow", "bounced",
+)  # fmt: skip
 
 
-def _momentum(table: Bodies) -> Floats:
-    """That of all bodies (3,) which forces move [N s]."""
-    moves = bodies.is_dynamic(table)
-    total: Floats = table.mass[moves] @ table.velocity[moves, :3]
-    return total
+def _ledger(step: Step, table: Bodies, rows: slice) -> tuple[float, ...]:
+    """Of the bodies of a table, which have these rows of `near`, the kinetic and potential energy before the step and
+    after it, the work of gravity on their mean velocities, the kinetic energy that they may have at rest by the errors
+    of a solver, and the energy of their weights times a part SUNK of their radii [J]."""
+    before, gravity, dt = step.contacts.near.bodies, step.world.gravity, step.system.dt
+    return ledger(
+        (table.mass, table.inertia, table.shape, table.size),
+        (before.position[rows], before.quaternion[rows], before.velocity[rows]),
+        (table.position, table.quaternion, table.velocity), gravity, dt, SLOW * dt * math.hypot(*gravity), CREEP / dt,
+    )  # fmt: skip
 
 
-def _summed(comm: MPI.Comm, **numbers: float) -> dict[str, float]:
-    """Numbers by name, summed over the ranks; collective."""
-    return dict(zip(numbers, reduced(comm, [*numbers.values()], ())[0]))
+@loop
+def ledger(kinds, before, after, gravity, dt, fall, creep):
+    """The loop of `_ledger`, over n bodies of masses, moments, shapes and sizes, and their places, orientations and
+    velocities. A body is at rest below the speed `fall` [m/s], a part SLOW of what gravity gives in a step, or below
+    `creep` radii [1/s], of large bodies those of gyration."""
+    (mass, inertia, shape, size), (place, turn, velocity), (new_place, new_turn, new_velocity) = kinds, before, after
+    kinetic, potential, new_kinetic, new_potential, falling, still, sunk = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    g = np.sqrt(gravity[0] ** 2 + gravity[1] ** 2 + gravity[2] ** 2)
+    for n in range(len(mass)):
+        if np.isfinite(mass[n]):
+            kinetic = add_kinetic(kinetic, turn[n], velocity[n], mass[n], inertia[n])
+            new_kinetic = add_kinetic(new_kinetic, new_turn[n], new_velocity[n], mass[n], inertia[n])
+            for k in range(3):
+                weight = mass[n] * gravity[k]
+                potential -= weight * place[n, k]
+                new_potential -= weight * new_place[n, k]
+                falling += 0.5 * dt * weight * (velocity[n, k] + new_velocity[n, k])
+            radius = radius_about(shape[n], size[n])
+            if shape[n] == COMPOUND:
+                radius = np.sqrt(min(inertia[n, 0], inertia[n, 1], inertia[n, 2]) / mass[n])
+            radius = radius if np.isfinite(radius) else 0.0  # what cannot turn has no radius
+            still += 0.5 * mass[n] * max(fall, creep * radius) ** 2
+            sunk += SUNK * g * mass[n] * radius
+    return kinetic, potential, new_kinetic, new_potential, falling, still, sunk
 
 
 def works(
     step: Step, impulse: Floats, before: Floats, moment: Floats | None = None
-) -> tuple[float, float, Floats]:
+) -> tuple[float, float, Floats, Floats]:
     """Return the work of this rank's normal impulses, and of its tangential ones and moments (nc, 3), on the mean of
     the velocities `before` (rows, 6), of all rows of `near`, and of those after the step [J]; and the normal velocities
-    (nc,) of the latter; collective."""
+    (nc,) of both; collective."""
     system, near = step.system, step.contacts.near
     after = np.zeros(before.shape)
     after[: near.grains] = step.world.grains.velocity
     system.contact_map.halo.update(after)
     after[near.grains + near.ghosts :] = step.world.large.velocity
-    normal, tangential, opening = system.contact_map.works(impulse, before, after)
+    normal, tangential, came, opening = system.contact_map.works(impulse, before, after)
     if system.drift is not None:
-        normal, opening = normal + float(impulse[:, 0] @ system.drift[:, 0]), opening + system.drift[:, 0]
+        came, opening = came + system.drift[:, 0], opening + system.drift[:, 0]
+        normal += float(impulse[:, 0] @ system.drift[:, 0])
         tangential += float(np.vdot(impulse[:, 1:], system.drift[:, 1:]))
     if moment is not None and system.resistance is not None:
         turning = system.resistance.map.turning
         tangential += 0.5 * float(np.vdot(moment, turning(before) + turning(after)))
-    return normal, tangential, opening
+    return normal, tangential, came, opening
 
 
-def elastic_energies(step: Step, before: Floats, opening: Floats) -> tuple[float, float, float, float]:
-    """Return `dem.start.stiffness.elastic_energies` of a step, with the velocities `before` (rows, 6) and the normal
-    ones of its end `opening` (nc,)."""
+def elastic_energies(step: Step, came: Floats, opening: Floats) -> tuple[float, float, float, float]:
+    """Return `dem.start.stiffness.elastic_energies` of a step, with the normal velocities (nc,) with which contacts
+    `came`, and those of its end, `opening`."""
     system, contacts = step.system, step.contacts
-    came = system.contact_map.relative_velocities(before)[:, 0]
-    if system.drift is not None:
-        came = came + system.drift[:, 0]
-    gaps = contacts.gap - system.dt * came, contacts.gap, contacts.linear_gap + system.dt * opening
-    held = system.last, system.held, step.in_cone
-    return stiffness.elastic_energies(system.stiffness, system.compliance, system.dt, *gaps, *held)
-
-
-def _still(table: Bodies, gravity: Floats, dt: float) -> tuple[float, float]:
-    """The kinetic energy [J] that bodies at rest may have by the errors of a solver: a part SLOW of what gravity gives
-    in a step, or a way of CREEP radii, of large bodies those of gyration. And the energy of their weights times a part
-    SUNK of these radii [J]."""
-    radius, g = bodies.bounding_radius(table), math.hypot(*gravity)
-    energy, moment = still_energy(table.mass, table.inertia, table.shape, radius, SLOW * dt * g, CREEP / dt)
-    return energy, SUNK * g * moment
-
-
-@loop
-def still_energy(
-    mass: Floats, inertia: Floats, shape: Ints, radius: Floats, fall: float, creep: float
-) -> tuple[float, float]:
-    """The kinetic energy [J] of n bodies with the speed `fall` [m/s], or with `creep` radii [1/s] if that is more; and
-    the sum of masses times radii [kg m]."""
-    energy, moment = 0.0, 0.0
-    for n in range(len(mass)):
-        if np.isfinite(mass[n]):
-            size = radius[n]
-            if shape[n] == COMPOUND:
-                size = np.sqrt(min(inertia[n, 0], inertia[n, 1], inertia[n, 2]) / mass[n])
-            size = size if np.isfinite(size) else 0.0  # what cannot turn has no radius
-            speed = max(fall, creep * size)
-            energy += 0.5 * mass[n] * speed**2
-            moment += mass[n] * size
-    return energy, moment
+    return stiffness.elastic_energies(
+        system.stiffness, system.compliance, system.dt, contacts.gap, contacts.linear_gap, came, opening,
+        (system.last, system.held), step.in_cone,
+    )  # fmt: skip
 
 
 def _holding_work(step: Step, before: Floats, mean: Floats) -> float:
@@ -298,9 +297,10 @@ def _constraint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, 
 def _carried(step: Step, prescribed: Bools) -> float:
     """The kinetic energy [J] that bodies have which go with the `prescribed` (large,) motions that they touch, on this
     rank."""
-    velocity = np.where(prescribed[:, None], step.world.large.velocity, 0.0)
+    velocity = step.world.large.velocity
     if not velocity.any():
         return 0.0
+    velocity = np.where(prescribed[:, None], velocity, 0.0)
     near, arm = step.contacts.near, step.system.contact_map.source.arm
     first, mass = near.grains + near.ghosts, near.bodies.mass
     return carried_energy(velocity, first, mass, step.contacts.a, step.contacts.b, arm)
@@ -338,14 +338,13 @@ def contact_statistics(step: Step) -> dict[str, float]:
     energy may be lost.
     """
     comm, contacts, impulse = step.world.comm, step.contacts, step.in_cone
-    grains, before = step.world.grains, contacts.near.bodies.velocity
-    push, size = momentum_change(grains.mass, before, grains.velocity), impulse_sizes(impulse)
-    (count, weight, push, size), _ = reduced(comm, (len(contacts), impulse[:, 0].sum(), push, size), ())
-    grain = contacts.near.bodies.shape != COMPOUND
+    grains, before = step.world.grains, contacts.near.bodies
+    of_all = len(contacts), *exchanged(grains.mass, before.velocity, grains.velocity, impulse)
+    (count, weight, push, size), _ = reduced(comm, of_all, ())
     least = 0.01 * weight / max(count, 1.0)
-    *sums, worst = counted(impulse, step.system.friction, contacts.gap, contacts.a, contacts.b, grain, least)
+    *sums, worst = counted(impulse, step.system.friction, contacts.gap, contacts.a, contacts.b, before.shape, least)
     sums, (worst,) = reduced(comm, [*sums, step.system.at_once], (max(worst, contacts.held_overlap),))
-    bounces = {"impacts_at_once": sums[3]} if step.world.pairs.restitution.any() else {}
+    bounces = {"impacts_at_once": sums[3]} if step.world.pairs.bounces else {}
     return {
         "contacts": count,
         "active_contacts": sums[0],
@@ -358,27 +357,22 @@ def contact_statistics(step: Step) -> dict[str, float]:
 
 
 @loop
-def momentum_change(mass: Floats, before: Floats, after: Floats) -> float:
-    """The sum of the sizes of the changes of the momenta of n bodies of finite mass, with velocities (n, 6) before and
-    after [N s]; `before` may have more rows."""
-    total = 0.0
+def exchanged(mass: Floats, before: Floats, after: Floats, impulse: Floats) -> tuple[float, float, float]:
+    """The sum of normal impulses among those (nc, 3); that of the sizes of the changes of the momenta of n bodies of
+    finite mass, with velocities (n, 6) before and after, of which `before` may have more rows; and that of the sizes of
+    impulses [N s]."""
+    weight, push, size = 0.0, 0.0, 0.0
     for n in range(len(mass)):
         x, y, z = after[n, 0] - before[n, 0], after[n, 1] - before[n, 1], after[n, 2] - before[n, 2]
-        total += mass[n] * np.sqrt(x * x + y * y + z * z)
-    return total
-
-
-@loop
-def impulse_sizes(impulse: Floats) -> float:
-    """The sum of the sizes of impulses (nc, 3)."""
-    total = 0.0
+        push += mass[n] * np.sqrt(x * x + y * y + z * z)
     for c in range(len(impulse)):
-        total += np.sqrt(impulse[c, 0] ** 2 + impulse[c, 1] ** 2 + impulse[c, 2] ** 2)
-    return total
+        weight += impulse[c, 0]
+        size += np.sqrt(impulse[c, 0] ** 2 + impulse[c, 1] ** 2 + impulse[c, 2] ** 2)
+    return weight, push, size
 
 
 @loop
-def counted(impulse, friction, gap, a, b, grain, least):
+def counted(impulse, friction, gap, a, b, shape, least):
     """Of contacts of bodies in the rows a, b (nc,), those active whose normal impulse exceeds the `least`: their
     number, how many of them slide, how many ends of them are at grains; and the greatest overlap of all, 0 if none."""
     active, sliding, ends, worst = 0, 0, 0, 0.0
@@ -388,5 +382,5 @@ def counted(impulse, friction, gap, a, b, grain, least):
         bearing, slides = normal > least, np.sqrt(impulse[c, 1] ** 2 + impulse[c, 2] ** 2) >= bears
         active += bearing
         sliding += bearing & slides
-        ends += bearing * (int(grain[a[c]]) + int(grain[b[c]]))
+        ends += bearing * (int(shape[a[c]] != COMPOUND) + int(shape[b[c]] != COMPOUND))
     return active, sliding, ends, worst

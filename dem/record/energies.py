@@ -6,7 +6,7 @@ import numpy as np
 
 from dem.arrays import Floats
 from dem.bodies import Bodies
-from dem.compiled import loop
+from dem.compiled import inlined, loop
 
 
 def energy(table: Bodies, gravity: Floats) -> tuple[float, float]:
@@ -24,15 +24,21 @@ def energies(position: Floats, turn: Floats, velocity: Floats, mass: Floats, ine
     for n in range(len(mass)):
         if np.isfinite(mass[n]):
             for k in range(3):
-                kinetic += 0.5 * mass[n] * velocity[n, k] ** 2
                 moment[k] += mass[n] * position[n, k]
-            w, x, y, z = turn[n, 0], -turn[n, 1], -turn[n, 2], -turn[n, 3]
-            a, b, c = velocity[n, 3], velocity[n, 4], velocity[n, 5]
-            p, q, r = y * c - z * b, z * a - x * c, x * b - y * a  # to the frame of the body
-            spin = (
-                a + 2.0 * (w * p + y * r - z * q), b + 2.0 * (w * q + z * p - x * r), c + 2.0 * (w * r + x * q - y * p)
-            )  # fmt: skip
-            for k in range(3):
-                if np.isfinite(inertia[n, k]):
-                    kinetic += 0.5 * inertia[n, k] * spin[k] ** 2
+            kinetic = add_kinetic(kinetic, turn[n], velocity[n], mass[n], inertia[n])
     return kinetic, moment
+
+
+@inlined
+def add_kinetic(kinetic, turn, velocity, mass, inertia):
+    """An energy [J] and that of a body of finite mass."""
+    for k in range(3):
+        kinetic += 0.5 * mass * velocity[k] ** 2
+    w, x, y, z = turn[0], -turn[1], -turn[2], -turn[3]
+    a, b, c = velocity[3], velocity[4], velocity[5]
+    p, q, r = y * c - z * b, z * a - x * c, x * b - y * a  # to the frame of the body
+    spin = a + 2.0 * (w * p + y * r - z * q), b + 2.0 * (w * q + z * p - x * r), c + 2.0 * (w * r + x * q - y * p)
+    for k in range(3):
+        if np.isfinite(inertia[k]):
+            kinetic += 0.5 * inertia[k] * spin[k] ** 2
+    return kinetic

@@ -152,14 +152,6 @@ def compliance(stiffness: float, mass: float, dt: float) -> tuple[float, float, 
 
 
 @loop
-def subtract_held_impulses(r: Floats, compliance: Floats, held: Floats) -> None:
-    """Take from r (nc, 3) what tangential springs give that held these impulses (nc, 2) before the step."""
-    for c in range(len(r)):
-        for k in range(2):
-            r[c, 1 + k] -= compliance[c, 1] * held[c, k]
-
-
-@loop
 def held_after(stiffness: Floats, compliance: Floats, dt: float, held: Floats, impulse: Floats) -> Floats:
     """The impulses (nc or more, 3) of a step, with what tangential springs hold after it in the place of the tangential
     ones of the first nc: all of these in rigid contacts, and nothing in those that bounce, whose C is zero."""
@@ -181,23 +173,27 @@ def _held_after(stiffness, compliance, dt, held, impulse, c):
 
 @loop
 def elastic_energies(
-    stiffness: Floats, compliance: Floats, dt: float, past: Floats, gap: Floats, after: Floats, last: Floats,
-    held: Floats, impulse: Floats,
+    stiffness: Floats, compliance: Floats, dt: float, gap: Floats, linear: Floats, came: Floats, opening: Floats,
+    before: tuple[Floats, Floats], impulse: Floats,
 ) -> tuple[float, float, float, float]:  # fmt: skip
     """What contacts hold as springs at the start and at the end of a step, along the normals and then along the
     tangents [J]. Rigid ones hold nothing.
 
-    That is k/2 d^2 of an overlap d, of the `gap` (nc,) at the start and `after` the step, but of no more overlap than
-    the normal impulses of this step and of the `last` one (nc,), which began with the gaps `past` [m], make: what a
-    solver or the curves of surfaces leave beyond has done no work, and an implicit step does not give it back. And
-    h^2 / (2 k_t dt^2) of the impulse h that a tangential spring holds, `held` (nc, 2) at the start."""
+    That is k/2 d^2 of an overlap d, of the `gap` (nc,) at the start, and after the step of the `linear` one (nc,) with
+    the normal velocity `opening` (nc,). But of no more overlap than the normal impulses make, of this step and of the
+    last one, which began with the gaps from which the contacts `came` (nc,) [m/s]: what a solver or the curves of
+    surfaces leave beyond has done no work, and an implicit step does not give it back. And h^2 / (2 k_t dt^2) of the
+    impulse h that a tangential spring holds. `before` is the normal impulse (nc,) of the last step, and what tangential
+    springs hold at the start (nc, 2)."""
+    last, held = before
     start, end, strained, strained_at_end = 0.0, 0.0, 0.0, 0.0
     for c in range(len(gap)):
         if np.isinf(stiffness[c]):
             continue
         k, per = stiffness[c], TANGENTIAL * stiffness[c] * dt**2
-        start += 0.5 * k * _loaded_overlap(k, compliance[c, 0], dt, past[c], gap[c], last[c]) ** 2
-        end += 0.5 * k * _loaded_overlap(k, compliance[c, 0], dt, gap[c], after[c], impulse[c, 0]) ** 2
+        start += 0.5 * k * _loaded_overlap(k, compliance[c, 0], dt, gap[c] - dt * came[c], gap[c], last[c]) ** 2
+        after = linear[c] + dt * opening[c]
+        end += 0.5 * k * _loaded_overlap(k, compliance[c, 0], dt, gap[c], after, impulse[c, 0]) ** 2
         one, other = _held_after(stiffness, compliance, dt, held, impulse, c)
         strained += 0.5 * (held[c, 0] ** 2 + held[c, 1] ** 2) / per
         strained_at_end += 0.5 * (one**2 + other**2) / per

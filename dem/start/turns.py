@@ -29,7 +29,11 @@ STEADY = 5  #: steps after each other in which the same body does so before it i
 
 def turning_of_large(table: bodies.Bodies, members: Sequence[LargeBody]) -> Floats:
     """`dem.bodies.turning` of the large bodies of a table (n,) [rad/s]; zero of balls about their centres of mass."""
-    return bodies.turning(table) * np.array([not _is_ball(body) for body in members], float)
+    speeds = bodies.turning(table)
+    for row in speeds.nonzero()[0].tolist():
+        if _is_ball(members[row]):
+            speeds[row] = 0.0
+    return speeds
 
 
 def held_beside(named: Mapping[str, Mapping[str, Any]]) -> list[int]:
@@ -69,7 +73,7 @@ class TurnWatch:
         of_grains = turning_of_grains(world.grains, self._held)
         speeds = np.concatenate([of_grains, turning_of_large(world.large, world.large_bodies)])
         ids = np.concatenate([world.grains.id, world.large.id])
-        row = int(np.argmax(speeds)) if len(speeds) else -1
+        row = int(speeds.argmax()) if len(speeds) else -1
         mine = (float(speeds[row]), int(ids[row])) if len(speeds) else (0.0, -1)
         speed, id = greatest(world.comm, mine)
         again = self._times + 1 if self._last in (-1, id) else 1

@@ -11,9 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
-from dem import bodies, quaternion
+from dem import quaternion
 from dem.arrays import ArrayLike, Bools, Floats, Ints, Keys, places
-from dem.bodies import BOX, CLUMP, COMPOUND, CONVEX, POLYHEDRON, SPHERE, Bodies
+from dem.bodies import BOX, CLUMP, COMPOUND, CONVEX, POLYHEDRON, SPHERE, Bodies, radius_about
+from dem.compiled import loop
 from dem.contact import Contacts, contact_order, exceeds_margin, find_contacts, greatest_travel, velocities_about
 from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
@@ -21,7 +22,7 @@ from dem.measures import Sample
 from dem.model.world import World
 from dem.shapes.forms import arms
 from dem.step.laws import along_normal
-from dem.step.system import ContactSystem, contact_arms, contact_frames, gap_velocities
+from dem.step.system import ContactSystem, contact_arms, gap_velocities
 from dem.together import barrier
 from dem.unconstrained import UnconstrainedMotion, large_velocity
 
@@ -214,7 +215,7 @@ def _opening(world: World, contacts: Contacts, position: Floats, velocity: Float
     """Normal velocities (nc,) of contacts of bodies with these positions and velocities (rows, 3 and 6)."""
     row = np.stack([contacts.a, contacts.b], axis=1).astype(np.uint32)
     arm = contact_arms(contacts, position, row)
-    opening: Floats = relative_velocities(contact_frames(contacts.normal).reshape(-1, 9), arm, row, velocity)[:, 0]
+    opening: Floats = relative_velocities(contacts.frame.reshape(-1, 9), arm, row, velocity)[:, 0]
     flow = contacts.flow(world.cell, position)
     return opening if flow is None else opening + np.einsum("ci,ci->c", contacts.normal, flow)
 
@@ -317,13 +318,28 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
     centres go on arcs: at most c w^2 / 2 off their tangents, for a distance c from the centre, of each of a pair."""
     if world.only_spheres:
         return False
-    grains, angle = world.grains, dt * quaternion.length(velocity[:, 3:])
-    way, of_spheres = bodies.bounding_radius(grains) * angle, (grains.shape >= CLUMP) & (grains.shape < POLYHEDRON)
-    if of_spheres.any():
-        way[of_spheres] = arms(world.forms)[grains.shape[of_spheres] - CLUMP] * angle[of_spheres] ** 2
-    fast, finite = bool((way[grains.shape != SPHERE] > depth).any()), bool(np.isfinite(velocity).all())
-    fast, not_finite = on_any(world.comm, fast, not finite)
+    grains = world.grains
+    fast, not_finite = on_any(world.comm, *turned(velocity, grains.shape, grains.size, arms(world.forms), dt, depth))
     return fast and not not_finite
+
+
+@loop
+def turned(
+    velocity: Floats, shape: Ints, size: Floats, arms: Floats, dt: float, depth: float
+) -> tuple[bool, bool]:
+    """The loop of `_turn` over grains of shapes (n,) and sizes (n, 3), with the `arms` (forms,) of clumps: whether one
+    turns so far, and whether a velocity (n, 6) is not finite."""
+    fast, not_finite = False, False
+    for n in range(len(shape)):
+        x, y, z = velocity[n, 3], velocity[n, 4], velocity[n, 5]
+        angle = dt * np.sqrt(x * x + z * z + y * y)
+        way = radius_about(shape[n], size[n]) * angle
+        if CLUMP <= shape[n] < POLYHEDRON:
+            way = arms[shape[n] - CLUMP] * angle**2
+        fast = fast or (shape[n] != SPHERE and way > depth)
+        for k in range(6):
+            not_finite = not_finite or not np.isfinite(velocity[n, k])
+    return fast, not_finite
 
 
 def _at_start(world: World, end: Contacts, velocity: Floats, dt: float) -> tuple[Contacts, Floats]:

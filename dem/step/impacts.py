@@ -60,20 +60,19 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     faster than `slowest`; without restitution those of two that are near no other. Two spheres that pass each
     other have no contact that closes. In cells that deform, and where bodies attract each other, nothing is
     followed."""
-    if world.cell.moves or world.pairs.attracts:
+    if world.cell.moves or world.pairs.attracts or not world.any_spheres:
         return contacts
     near, table, pairs, dt = contacts.near, contacts.near.bodies, world.pairs, motion.dt
     grains, old = near.grains + near.ghosts, table.velocity
     ball = table.shape == SPHERE
     ball[grains:] = False
     ball[slots(world, table.id)[0]] = False
-    bounces = bool(pairs.restitution.any())
-    if bounces:
+    if pairs.bounces:
         old = old.copy()
         old[grains:] = motion.prescribed
     image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     radius = np.ascontiguousarray(table.size[:, 0])
-    free = velocities_about(contacts, motion.grains, old[grains:]) if bounces else old
+    free = velocities_about(contacts, motion.grains, old[grains:]) if pairs.bounces else old
     forced = free[:, :3] - old[:, :3]
     closing = np.einsum("ci,ci->c", contacts.normal, forced[contacts.a] - forced[contacts.b])
     slow = slowest(world, contacts, dt, closing, forced)
@@ -86,7 +85,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         return contacts
     rows = np.stack([contacts.a, contacts.b], axis=1)
     chosen = np.flatnonzero(_reached(world, contacts, rows, kind, marked)[rows].any(axis=1))
-    if not bounces:
+    if not pairs.bounces:
         free = velocities_about(contacts, motion.grains, old[grains:])
         forced = free[:, :3] - old[:, :3]
     columns = (table.position, free, forced, radius[:, None], table.mass[:, None], table.inertia[:, :1])

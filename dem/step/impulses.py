@@ -48,9 +48,10 @@ class ImpulseMemory:
         end = 4 * self._parts
         each, columns = [stored[:, first : first + 4] for first in range(0, end, 4)], stored[:, end:]
         found = [in_frames(np.ascontiguousarray(part), place, frame) for part in each]
-        kept = np.zeros((len(place), columns.shape[1]))
-        kept[place >= 0] = columns[place[place >= 0]]
-        return found[0] if self._parts == 1 else np.concatenate(found), place >= 0, kept
+        kept, known = np.zeros((len(place), columns.shape[1])), place >= 0
+        if columns.shape[1]:
+            kept[known] = columns[place[known]]
+        return found[0] if self._parts == 1 else np.concatenate(found), known, kept
 
     def _elsewhere(self, asked: Keys, key: Keys, impulse: Floats) -> tuple[Ints, Floats]:
         """Which of the keys `asked` (m,) other ranks offer in their `key` (n,), and their impulses; collective."""

@@ -21,15 +21,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies
 from dem.arrays import Floats, Keys, places
 from dem.bodies import Bodies
-from dem.compiled import loop
+from dem.compiled import inlined, loop
 from dem.contact_map import CompactRows, ContactMap, Halo
-from dem.contact_map.loops import closing, scale
+from dem.contact_map.loops import closing, scaled_row
 from dem.contact_map.mass import CellMass, ConstrainedMass
 from dem.contact_map.rows import UPPER
-from dem.free_motion import kept_spin
+from dem.free_motion import kept_velocities
 from dem.model.world import World
 from dem.parts.laws import Solved
 from dem.start import stiffness
@@ -103,7 +102,7 @@ class ContactSystem:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
         self.dt, self.contacts, self.near, self.drives, self.applied = dt, contacts, near, motion.drives, motion.applied
         self.key, self.point = contacts.key, contacts.point
-        self.frame = contact_frames(contacts.normal)
+        self.frame = contacts.frame
         self.contact_map = _map_of(world, contacts, self.frame, self.drives)
         self.surface = surface_velocities(world, contacts, self.frame)
         self.take_flow(world, contacts)
@@ -143,8 +142,8 @@ class ContactSystem:
         if self.resistance is not None and self.attraction is not None:
             self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
         self.at_once, self._freely = 0, freely
-        self._bounces, self._part = np.zeros(len(contacts), np.bool_), np.ones(len(contacts))
-        if world.pairs.restitution.any():
+        self._bounces = np.zeros(len(contacts), np.bool_)
+        if world.pairs.bounces:
             self._bounce(world, contacts, freely[:, 0], eased)
         impacts = self._bounces
         if contacts.parting is not None:
@@ -153,10 +152,8 @@ class ContactSystem:
             impacts = impacts | strikes
         if smooth:
             self.mu = np.where(impacts, 0.0, self.mu)
-        if contacts.swing is not None:  # impacts last no step
-            self.b[:, 1:] += np.where(impacts[:, None], 0.0, np.einsum("cij,cj->ci", self.frame[:, 1:], contacts.swing))
-        self.r = _beyond(self.b, freely, rounding)
-        stiffness.subtract_held_impulses(self.r, self.compliance, self.held)
+        swing = np.zeros((0, 3)) if contacts.swing is None else contacts.swing
+        self.r = _beyond(self.b, freely, rounding, self.frame, swing, impacts, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
 
@@ -170,13 +167,12 @@ class ContactSystem:
         if push is None and world.turns_unlike_spheres:
             push = self.contact_map.momenta(self.net(last))
         if push is not None:
-            change = np.empty(push.shape)
-            scale(self.contact_map.source.root, push, change)
-            struck = self.dt * np.abs(change[:, 3:]).max(axis=1) > STRUCK
-            push[struck], change[struck] = 0.0, 0.0
+            change = _expected(self.contact_map.source.root, push, self.dt)
         coupling = motion.coupling
         if coupling is None:
             coupling = coupling_of(world, motion.applied, motion.motion_velocities, self.dt, push)
+        if push is motion.push and coupling is motion.coupling:
+            return motion, change
         return replace(motion, push=push, coupling=coupling), change
 
     def _free(self, world: World, change: Floats | None) -> tuple[Floats, Floats, Floats]:
@@ -186,8 +182,8 @@ class ContactSystem:
         free, self.middle = free_velocities(world, self.near, self.motion, change)
         if self.applied is not None or change is not None:
             self.contact_map.halo.update(free)
-        if world.pairs.restitution.any():
-            moves = bodies.is_dynamic(self.near.bodies)[:, None]
+        if world.pairs.bounces:
+            moves = np.isfinite(self.near.bodies.mass)[:, None]
             self._forced = np.where(moves, free[:, :3] - self.near.bodies.velocity[:, :3], 0.0)  # not by constraints
         freely, rounding = closing(given.frame, given.arm, row, free)
         if self.coupling is not None:
@@ -221,7 +217,7 @@ class ContactSystem:
         begin = (e > 0.0) & (came < -slow) & closes
         if contacts.parting is not None:
             begin &= np.isnan(contacts.parting)
-        self.at_once, self._bounces = int(begin.sum()), begin
+        self.at_once, self._bounces, self._part = int(begin.sum()), begin, np.ones(len(contacts))
         if eased is not None:
             place = places(eased[0], self.key)
             self._part[place >= 0] = eased[1][place[place >= 0]]
@@ -234,7 +230,7 @@ class ContactSystem:
         work, where all contacts together, with these impulses (parts nc, 3) and momenta, make energy. Newton's law of
         impacts may do so with friction (Kane and Levinson 1985), and does not at e = 0. None if they make none, or if
         no part is left; collective."""
-        if not world.pairs.restitution.any():
+        if not world.pairs.bounces:
             return None
         parts = 1 if self.resistance is None else 2
         g = impulse.reshape(parts, len(self.key), 3)
@@ -293,15 +289,11 @@ class ContactSystem:
 
     def kept(self, velocity: Floats) -> Floats | None:
         """The velocities (owned, 6) with which bodies go into the next step, where those of this one are `velocity`:
-        others of bodies that are no spheres, see `dem.free_motion.kept_spin`; None: the same."""
+        others of bodies that are no spheres, see `dem.free_motion.kept_velocities`; None: the same."""
         if self.middle is None:
             return None
-        own = self.near.bodies.take(slice(len(velocity)))
-        out = velocity.copy()
-        rows = np.isfinite(self.middle[:, 0]).nonzero()[0]
-        spins = velocity[rows, 3:], self.middle[rows]
-        out[rows, 3:] = kept_spin(own.quaternion[rows], *spins, own.inertia[rows], self.dt)
-        return out
+        table = self.near.bodies
+        return kept_velocities(table.quaternion, velocity, self.middle, table.inertia, self.dt)
 
     def set_rate(self, world: World, momentum: Floats) -> None:
         """Give a cell that deforms the rate of its periods in this step, for the momenta of `velocity_with`;
@@ -320,9 +312,9 @@ class ContactSystem:
         """Impulses and angular impulses D g (large, 6) on the large bodies, the same on all ranks, from the impulses
         and the moments of `dem.step.resistance` (nc, 3) of all ranks [N s, N m s]; collective."""
         first = self.near.grains + self.near.ghosts
-        rows = (self.contact_map.body[:, 1] >= first).nonzero()[0]  # body b has the higher id
-        sums = self.contact_map.sums_of_impulses(impulse, rows)
+        sums = self.contact_map.sums_of_impulses(impulse, first)  # body b has the higher id
         if moment is not None and self.resistance is not None:
+            rows = (self.contact_map.body[:, 1] >= first).nonzero()[0]
             self.resistance.map.sums_of_moments(moment, rows, sums)
         large = sums[first:].copy()
         self.contact_map.comm.Allreduce(MPI.IN_PLACE, large)
@@ -357,21 +349,25 @@ class ContactSystem:
     def drive_impulse(self, large: Floats) -> Floats:
         """Impulses and angular impulses (large, 6) of the drives of large bodies, and of parts on them, that have the
         velocities `large` (large, 6) after the step."""
+        if not self.drives.servo_inertia.any():
+            return self.drives.impulse
         line, slip = self.drives.line, self.free_large - large
         return self.drives.impulse + (self.drives.servo_inertia * np.einsum("bi,bi->b", line, slip))[:, None] * line
 
 
 def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> ContactMap:
     """The map of contacts with these frames (nc, 3, 3), of bodies that nothing couples beside them; collective."""
-    near, owned, moves = contacts.near, world.owned, bodies.is_dynamic(contacts.near.bodies)
+    near, owned, table = contacts.near, world.owned, contacts.near.bodies
+    moved = np.zeros((0, 3)) if contacts.moved is None else contacts.moved
     # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
-    row, body, touched = _rows_of(contacts.a, contacts.b, contacts.body, moves, owned)
-    arm = contact_arms(contacts, near.bodies.position, row)
+    row, body, touched, arm = _rows_of(
+        contacts.a, contacts.b, contacts.body, table.mass, owned, contacts.point, moved, table.position
+    )
     rows = CompactRows(frame.reshape(-1, 9), arm, body, inverse_root_masses(world, drives), owned)
     ghosts = touched.nonzero()[0]
     index = near.index[ghosts]
-    owner = np.minimum(np.searchsorted(world.slabs, index, side="right"), world.comm.size) - 1
-    halo = Halo(world.comm, owned, len(moves), ghosts, owner, index - world.slabs[owner])
+    owner = np.minimum(world.slabs.searchsorted(index, side="right"), world.comm.size) - 1
+    halo = Halo(world.comm, owned, len(table), ghosts, owner, index - world.slabs[owner])
     return ContactMap(world.comm, rows, halo, row)
 
 
@@ -390,14 +386,28 @@ def inverse_root_masses(world: World, drives: Drives) -> Floats:
     on all ranks, else (owned, 12)."""
     last = world.comm.rank == world.comm.size - 1
     tables = [world.grains, with_servos(world.large, drives)] if last else [world.grains]
-    if world.only_spheres and not bodies.is_dynamic(world.large).any():
+    if world.only_spheres and not world.large_moves:
         parts = [_inverse_roots(table.mass, table.inertia) for table in tables]
         return np.concatenate(parts) if last else parts[0]
     out = np.concatenate([_inverse_roots_turned(table.mass, table.inertia, table.quaternion) for table in tables])
-    if last:
+    if last and world.large_moves:
         guided = free_directions(world.large_bodies) / np.sqrt(tables[1].mass)[:, None, None]
         out[len(world.grains) :, :6] = guided.reshape(-1, 9)[:, UPPER]
     return out
+
+
+@loop
+def _expected(root: Floats, push: Floats, dt: float) -> Floats:
+    """What mass-scaled momenta (n, 6) change of the velocities (n, 6). Of bodies that were struck both become zero."""
+    change = np.empty(push.shape)
+    for n in range(len(push)):
+        p = push[n]
+        new = scaled_row(root, n, p[0], p[1], p[2], p[3], p[4], p[5])
+        struck = dt * max(abs(new[3]), abs(new[4]), abs(new[5])) > STRUCK
+        for k in range(6):
+            change[n, k] = 0.0 if struck else new[k]
+            push[n, k] = 0.0 if struck else push[n, k]
+    return change
 
 
 @loop
@@ -443,29 +453,6 @@ def with_servos(large: Bodies, drives: Drives) -> Bodies:
     return replace(large, mass=mass, inertia=inertia)
 
 
-def contact_frames(normal: Floats) -> Floats:
-    """Return orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
-
-    Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
-    but where the sign of its z component changes.
-    """
-    return _frames(normal).reshape(-1, 3, 3)
-
-
-@loop
-def _frames(normal: Floats) -> Floats:
-    out = np.empty((len(normal), 9))
-    for c in range(len(normal)):
-        x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
-        sign = np.copysign(1.0, z)
-        p = -1.0 / (sign + z)
-        q = x * y * p
-        out[c, 0], out[c, 1], out[c, 2] = x, y, z
-        out[c, 3], out[c, 4], out[c, 5] = 1.0 + sign * x * x * p, sign * q, -sign * x
-        out[c, 6], out[c, 7], out[c, 8] = q, sign + y * y * p, -y
-    return out
-
-
 def contact_arms(contacts: Contacts, position: Floats, row: np.ndarray) -> Floats:
     """Return vectors (nc, 6) from the centres of the two bodies of each contact, or of the image of the second, to its
     point; `row` (nc, 2) are the bodies' rows, uint32, in a table of positions (rows, 3) [m]."""
@@ -477,35 +464,51 @@ def contact_arms(contacts: Contacts, position: Floats, row: np.ndarray) -> Float
 def _arms(point: Floats, moved: Floats, position: Floats, row: np.ndarray) -> Floats:
     out = np.empty((len(row), 6))
     for c in range(len(row)):
-        for k in range(3):
-            out[c, k] = point[c, k] - position[row[c, 0], k]
-            out[c, 3 + k] = point[c, k] - position[row[c, 1], k]
-            if len(moved):
-                out[c, 3 + k] -= moved[c, k]
+        _set_arm(c, point, moved, position, row, out)
     return out
 
 
+@inlined
+def _set_arm(c, point, moved, position, row, out):
+    for k in range(3):
+        out[c, k] = point[c, k] - position[row[c, 0], k]
+        out[c, 3 + k] = point[c, k] - position[row[c, 1], k]
+        if len(moved):
+            out[c, 3 + k] -= moved[c, k]
+
+
 @loop
-def _beyond(b: Floats, freely: Floats, rounding: Floats) -> Floats:
-    """b + freely (nc, 3), zero where it is not beyond the `rounding` (nc,)."""
+def _beyond(b, freely, rounding, frame, swing, impacts, compliance, held):
+    """b + freely (nc, 3), zero where it is not beyond the `rounding` (nc,), less what tangential springs give that held
+    the impulses `held` (nc, 2) before the step. First b gets the `swing` (nc, 3) along the surfaces, if there is any,
+    where there are no `impacts` (nc,), which last no step."""
     out = np.empty((len(rounding), 3))
     for c in range(len(rounding)):
+        if len(swing) and not impacts[c]:
+            for k in range(1, 3):
+                f, s = frame[c, k], swing[c]
+                b[c, k] += f[0] * s[0] + f[2] * s[2] + f[1] * s[1]
         for k in range(3):
             speed = b[c, k] + freely[c, k]
             out[c, k] = 0.0 if abs(speed) <= rounding[c] else speed
+        for k in range(2):
+            out[c, 1 + k] -= compliance[c, 1] * held[c, k]
     return out
 
 
 @loop
-def _rows_of(a, b, body, moves, owned):
+def _rows_of(a, b, body, mass, owned, point, moved, position):
     """Of contacts of bodies in the rows a and b (nc,): the rows (nc, 2), the indices `body` (nc, 2) of those that move,
-    else -1, and which rows that this rank does not own they touch and move."""
-    row, moved = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64)
-    touched = np.zeros(len(moves), np.bool_)
+    else -1, which rows that this rank does not own they touch and move, and the arms of `contact_arms`."""
+    row, moving = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64)
+    touched, arm = np.zeros(len(mass), np.bool_), np.empty((len(a), 6))
     for c in range(len(a)):
         row[c, 0], row[c, 1] = a[c], b[c]
-        for k, n in enumerate((a[c], b[c])):
-            moved[c, k] = body[c, k] if moves[n] else -1
-            if n >= owned and moves[n]:
+        for k in range(2):
+            n = row[c, k]
+            moves = np.isfinite(mass[n])
+            moving[c, k] = body[c, k] if moves else -1
+            if n >= owned and moves:
                 touched[n] = True
-    return row, moved, touched
+        _set_arm(c, point, moved, position, row, arm)
+    return row, moving, touched, arm

@@ -6,6 +6,7 @@ the record take what they need from it. Nothing else of a step asks motions and 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -14,8 +15,7 @@ import numpy as np
 
 from dem import bodies
 from dem.arrays import Floats, Ints
-from dem.checks import positive
-from dem.free_motion import fallen, free_spin, free_velocity, gyroscopic, velocity_changes
+from dem.free_motion import falling, free_velocity, spin_freely, velocity_changes
 from dem.model.neighbourhood import Neighbourhood
 from dem.model.world import World
 from dem.motion import Pose
@@ -52,10 +52,13 @@ class UnconstrainedMotion:
 def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
     """Return the motion over the next step of dt [s] without contacts; collective. SceneError if a motion or a part
     fails."""
-    positive("time step", dt)
+    if not 0.0 < dt < math.inf:
+        raise ValueError(f"time step must be positive, got {dt:g}")
     poses = world.poses(world.time + dt)
-    motion_velocities, moves = velocities_of_motions(world, poses, dt), bodies.is_dynamic(world.large)
-    prescribed = np.where(moves[:, None], world.large.velocity, motion_velocities)
+    prescribed = motion_velocities = velocities_of_motions(world, poses, dt)
+    if world.large_moves:
+        moves = bodies.is_dynamic(world.large)[:, None]
+        prescribed = np.where(moves, world.large.velocity, motion_velocities)
     applied, grains = applied_impulses(world, dt, motion_velocities), free_velocity(world.grains, world.gravity, dt)
     if applied is not None:
         grains += velocity_changes(world.grains, applied.grains)
@@ -66,13 +69,13 @@ def unconstrained(world: World, dt: float) -> UnconstrainedMotion:
 def _drives(world: World, dt: float, motion_velocities: Floats, applied: Applied | None, saturated: Ints) -> Drives:
     pushed = None if applied is None else applied.large
     call = partial(drives_of, world, dt, motion_velocities, pushed, saturated)
-    return together(world.comm, "motion of a large body", call) if bodies.is_dynamic(world.large).any() else call()
+    return together(world.comm, "motion of a large body", call) if world.large_moves else call()
 
 
 def large_velocity(world: World, free: UnconstrainedMotion, velocity: Floats) -> Floats:
     """Those (large, 6) of the large bodies, on all ranks, of the velocities (owned, 6) over the step of the bodies
     whose rows each rank owns; collective."""
-    if not bodies.is_dynamic(world.large).any():
+    if not world.large_moves:
         return free.prescribed
     large = np.zeros(world.large.velocity.shape)
     count = len(world.grains)
@@ -88,8 +91,8 @@ def free_velocities(
     right; and the angular ones (owned, 3) about which they are linear in the impulses, see
     `dem.free_motion.free_spin`, NaN where they are so anywhere. None without a `change` (owned, 6), what contacts are
     expected to change."""
-    velocity, _ = fallen(near.bodies, world.gravity, free.dt)
-    first = near.grains + near.ghosts
+    table, first = near.bodies, near.grains + near.ghosts
+    velocity, _ = falling(table.velocity, table.mass, table.shape, world.gravity, free.dt)
     pushed = None
     if free.applied is not None:
         pushed = velocity_changes(world.grains, free.applied.grains)
@@ -98,14 +101,9 @@ def free_velocities(
     if change is None:
         return velocity, None
     owned = len(change)
-    spin_change, middle = np.zeros((owned, 3)), np.full((owned, 3), np.nan)
+    given = np.zeros((owned, 3))
     if pushed is not None:
-        spin_change[: near.grains] = pushed[:, 3:]
-    if owned > near.grains:  # of the last rank, which has no ghosts
-        spin_change[near.grains :] = velocity_changes(world.large, free.drives.impulse)[:, 3:]
-    own = near.bodies.take(slice(owned))
-    rows = gyroscopic(own)
-    now = own.quaternion[rows], own.velocity[rows, 3:], own.inertia[rows]
-    spin, middle[rows] = free_spin(*now, free.dt, (spin_change + change[:, 3:])[rows])
-    velocity[rows, 3:] = spin + spin_change[rows]
-    return velocity, middle
+        given[: near.grains] = pushed[:, 3:]
+    if owned > near.grains and free.drives.impulse.any():  # of the last rank, which has no ghosts
+        given[near.grains :] = velocity_changes(world.large, free.drives.impulse)[:, 3:]
+    return velocity, spin_freely(table, velocity, given, change, free.dt)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dem import bodies
 from dem.arrays import Floats, Ints
 from dem.free_motion import free_velocity, velocity_changes
 from dem.motion import DROOP, Driven, Dynamic, Guided, Pose, velocity_between
@@ -51,7 +50,7 @@ def drives_of(world: World, dt: float, motion_velocities: Floats, pushed: Floats
     pushed = np.zeros(table.velocity.shape) if pushed is None else pushed
     impulse = pushed.copy()
     line, (servo_inertia, speed, bound) = np.zeros(impulse.shape), np.zeros((3, len(impulse)))
-    if not bodies.is_dynamic(table).any():
+    if not world.large_moves:
         return Drives(impulse, pushed, line, servo_inertia, speed, bound, saturated, motion_velocities)
     free = falling = free_velocity(table, world.gravity, dt)
     if pushed.any():

@@ -17,9 +17,10 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from dem.compiled import loop
 from dem.contact_map import BlockRows, CompactRows
 from dem.exchange import on_each
-from pctt.arrays import Array, tangential
+from pctt.arrays import Array, all_from
 from pctt.ccp.accuracy import Accuracy, figures, measure
 from pctt.ccp.cones import FrictionCones, RollingCones
 from pctt.ccp.coulomb import fixed_point
@@ -144,7 +145,7 @@ def _by(
         result = Result(nothing, Status.UNBOUNDED, words, cold, 0, solver=name, law=law)
         _measure(problem, result)
         return result
-    limits = dataclasses.replace(limits, max_it=method.iterations) if limits.max_it < 0 else limits
+    limits = limits.but(max_it=method.iterations) if limits.max_it < 0 else limits
     own = newton_for(problem.comm, name) if method.newton and newton is None else None
     systems = newton or own if method.newton else None
     if systems is not None:
@@ -169,7 +170,7 @@ def _by(
     result.solver = result.solver or name
     if method.needs == NEWTON:
         result.newton_its = result.iterations
-    if problem.sum(np.count_nonzero(~np.isfinite(result.impulse))):
+    if problem.sum(int(not all_from(result.impulse.ravel(), -np.inf))):
         result.reason = f"impulses are no numbers: {result.reason}"
         result.impulse, result.status, result.residual = nothing, Status.BREAKDOWN, cold
     elif unbounded := why_unbounded(problem, result.impulse):
@@ -188,21 +189,30 @@ def _measure(problem: ConeProblem, result: Result) -> Accuracy:
     rigid = problem.velocity_of(result.momentum)
     y = rigid + problem.compliance * result.impulse + problem.r
     result.velocity = y if problem.units is None else problem.velocities_by(result.impulse)
-    result.states = _states(problem, result.impulse, y, result.law != RELAXATION)
-    here = np.bincount(result.states, minlength=len(Counts._fields))
-    result.counts = Counts(*map(int, problem.sum(here)))
+    terms = problem.cones.de_saxce(y) if result.law == RELAXATION else np.zeros(0)
+    result.states, here = states(result.impulse, y, problem.diagonal, problem.mu, terms)
+    result.counts = Counts(*map(int, problem.sums(*here)))
     result.accuracy = figures(problem, result.impulse, rigid)
     return result.accuracy
 
 
-def _states(problem: ConeProblem, g: Array, y: Array, coulomb: bool) -> NDArray[np.int8]:
-    """Which contacts (nc,) are open (0), slide (1) and stick (2): of each two numbers that are complementary, impulses
-    in units of velocities, the larger one decides."""
-    nc, d, cones = problem.cones.count, problem.diagonal, problem.cones
-    opening = y[:nc, 0] if coulomb else y[:nc, 0] - cones.de_saxce(y)
-    open_ = d[:nc, 0] * g[:nc, 0] <= opening
-    room = 0.5 * (d[:nc, 1] + d[:nc, 2]) * (problem.mu * g[:nc, 0] - tangential(g[:nc]))
-    return np.where(open_, 0, np.where(room < tangential(y[:nc]), 1, 2)).astype(np.int8)
+@loop
+def states(
+    g: Array, y: Array, diagonal: Array, mu: Array, terms: Array
+) -> tuple[NDArray[np.int8], tuple[int, int, int]]:
+    """Which contacts (nc,) are open (0), slide (1) and stick (2), and how many do: of each two numbers that are
+    complementary, impulses in units of velocities, the larger one decides. With De Saxce's `terms` (nc,) of the
+    relaxation, or none."""
+    out, opens, slides = np.empty(len(mu), np.int8), 0, 0
+    for c in range(len(mu)):
+        opening = y[c, 0] - terms[c] if len(terms) else y[c, 0]
+        room = mu[c] * g[c, 0] - np.sqrt(g[c, 1] * g[c, 1] + g[c, 2] * g[c, 2])
+        opened = diagonal[c, 0] * g[c, 0] <= opening
+        room *= 0.5 * (diagonal[c, 1] + diagonal[c, 2])
+        slid = not opened and room < np.sqrt(y[c, 1] * y[c, 1] + y[c, 2] * y[c, 2])
+        out[c] = 0 if opened else 1 if slid else 2
+        opens, slides = opens + opened, slides + slid
+    return out, (opens, slides, len(mu) - opens - slides)
 
 
 def _print(comm: MPI.Comm, iterations: int, residual: float) -> None:

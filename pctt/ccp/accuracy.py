@@ -6,13 +6,15 @@ solver's own arithmetic shows.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dem.compiled import inlined, loop
 from dem.exchange import reduced
-from pctt.arrays import Array
+from pctt.arrays import TINY, Array
 from pctt.ccp.cones import FrictionCones
 from pctt.ccp.problem import ConeProblem
 
@@ -64,17 +66,19 @@ def figures(problem: ConeProblem, g: Array, rigid: Array) -> Accuracy:
     """Those of an impulse g (nc, 3) in the cones, whose velocities are ``rigid`` without compliance and r."""
     step = 1.0 / problem.mean_diagonal
     soft = problem.compliance[: None if problem.yields else 0]
+    sums: Sequence[float]
+    greatest: Sequence[float]
     if type(problem.cones) is FrictionCones:
         sums, greatest = _judged(g, rigid, soft, problem.r, problem.mu, step)
     else:
         sums, greatest = _judged_discs(problem, g, rigid + problem.compliance * g + problem.r, step)
     of_all, (cone, dual, complementarity, closes) = reduced(problem.comm, sums, greatest)
     square, speed, power, pushed, closing, opening, natural, coulomb = of_all
-    norm, energy = float(np.sqrt(square)), 0.5 * pushed
-    per = 1.0 / max(norm, float(np.finfo(float).tiny))
+    norm, energy = math.sqrt(square), 0.5 * pushed
+    per = 1.0 / max(norm, TINY)
     return Accuracy(
-        natural_residual=float(np.sqrt(natural)) * per,
-        coulomb_residual=float(np.sqrt(coulomb)) * per,
+        natural_residual=math.sqrt(natural) * per,
+        coulomb_residual=math.sqrt(coulomb) * per,
         objective=0.5 * power,
         cone_violation=cone,
         dual_violation=dual,
@@ -83,7 +87,7 @@ def figures(problem: ConeProblem, g: Array, rigid: Array) -> Accuracy:
         opening_work=_part(opening, energy),
         closing_speed=closes if closes == closes else np.inf,
         impulse_norm=norm,
-        velocity_norm=float(np.sqrt(speed)),
+        velocity_norm=math.sqrt(speed),
     )
 
 
@@ -96,10 +100,12 @@ def _part(work: float, energy: float) -> float:
 
 
 @loop
-def _judged(g: Array, rigid: Array, C: Array, r: Array, mu: Array, step: float) -> tuple[Array, Array]:
-    """Of impulses g and velocities y = N g + r (nc, 3) the sums (8,) over the contacts: of |g|^2, |y|^2, g.(y + r),
-    g.(y - r), the closing and the opening work, |g - P(g - step y)|^2 and the same of Coulomb's law; and the greatest
-    (4,): distances outside the cone and outside the dual one, |g.y|, and -y_n. Comparisons let a NaN through.
+def _judged(
+    g: Array, rigid: Array, C: Array, r: Array, mu: Array, step: float
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Of impulses g and velocities y = N g + r (nc, 3) eight sums over the contacts: of |g|^2, |y|^2, g.(y + r),
+    g.(y - r), the closing and the opening work, |g - P(g - step y)|^2 and the same of Coulomb's law; and the four
+    greatest: distances outside the cone and outside the dual one, |g.y|, and -y_n. Comparisons let a NaN through.
 
     N g is `rigid`, and C g more, of the diagonal C (nc, 3), or no row of it for zero."""
     sums, greatest = np.zeros(8), np.zeros(4)
@@ -129,7 +135,10 @@ def _judged(g: Array, rigid: Array, C: Array, r: Array, mu: Array, step: float) 
         greatest[1] = max(greatest[1], m * slip - y_n)
         greatest[2] = max(greatest[2], abs(along))
         greatest[3] = closing if closing > greatest[3] or closing != closing else greatest[3]
-    return sums, greatest
+    return (
+        (sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]),
+        (greatest[0], greatest[1], greatest[2], greatest[3]),
+    )
 
 
 @inlined
@@ -146,7 +155,9 @@ def _nearest_in_cone(n, u, v, mu):
     return n, u, v
 
 
-def _judged_discs(problem: ConeProblem, g: Array, y: Array, step: float) -> tuple[Array, Array]:
+def _judged_discs(
+    problem: ConeProblem, g: Array, y: Array, step: float
+) -> tuple[Sequence[float], Sequence[float]]:
     """The figures of `_judged` for any cones that discs meet; the height of a projection by Newton's method, whose
     steps ascend to it from below and end after one for each disc, as the function is concave with as many kinks."""
     cones, most = problem.cones, problem.cones.coefficients
@@ -178,4 +189,4 @@ def _judged_discs(problem: ConeProblem, g: Array, y: Array, step: float) -> tupl
         g_n @ np.maximum(-y_n, 0.0), np.maximum(along, 0.0).sum(), squared_move(y_n), squared_move(y_n + resisted),
     ]  # fmt: skip
     outside = np.max(sizes - most * g_n, initial=0.0), np.max(resisted - y_n, initial=0.0)
-    return np.array(sums), np.array([*outside, np.abs(along).max(initial=0.0), np.max(-y_n, initial=0.0)])
+    return sums, [*outside, np.abs(along).max(initial=0.0), np.max(-y_n, initial=0.0)]

@@ -124,21 +124,21 @@ class Attempts:
         return first, few
 
     def apgd(self, guess: Array, most: int, options: apgd.APGD = USUAL, spare: int = 0) -> Result:
-        limits = replace(self.rest, max_it=min(most, self.limits.max_it), spare=spare)
+        limits = self.rest.but(max_it=min(most, self.limits.max_it), spare=spare)
         return self.keep(apgd.solve(self.problem, guess, limits, options, coulomb=self.coulomb), "apgd")
 
     def conic(self, guess: Array, options: conic.Conic, basin: float = 0.0) -> Result:
         """To the limits, or to the ``basin`` of the residual alone."""
-        limits = replace(self.rest, max_it=self.most)
+        limits = self.rest.but(max_it=self.most)
         if basin:
-            limits = replace(limits, tol=basin, closing_work=np.inf, closing_speed=np.inf)
+            limits = limits.but(tol=basin, closing_work=np.inf, closing_speed=np.inf)
         given = self.problem, guess, limits, options, self.newton
         return self.keep(conic.solve(*given, coulomb=self.coulomb), "conic")
 
     def beyond(self, guess: Array, few: bool) -> None:
         """To the aim of limits that APGD has met: few contacts by the conic method, where APGD has not found it in its
         first attempt, many by APGD."""
-        given = guess, replace(self.rest, max_it=self.most), conic.Conic(), self.newton
+        given = guess, self.rest.but(max_it=self.most), conic.Conic(), self.newton
         if few or gathered.takes(self.problem, self.newton):
             method = conic if few else gathered
             self.keep(method.solve(self.problem, *given, coulomb=self.coulomb), "conic")
@@ -166,7 +166,7 @@ class Attempts:
                 return
         problem = self.problem
         by_conic = partial(conic.solve, options=conic.Conic(), newton=self.newton)
-        limits = replace(self.rest, max_it=self.most)
+        limits = self.rest.but(max_it=self.most)
         relaxed = by_conic(problem, np.zeros_like(problem.r), limits.unwatched)
         if why := why_unbounded(problem, relaxed.impulse):
             self.keep(replace(relaxed, status=Status.UNBOUNDED, reason=f"of the relaxation, {why}"), "conic")

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from operator import neg
 from typing import Any, Union
 
 import numpy as np
@@ -21,7 +22,7 @@ from scipy.sparse.linalg import LinearOperator, splu
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
 from dem.exchange import on_any, on_each, reduced, refuse
-from pctt.arrays import Array
+from pctt.arrays import Array, all_from
 from pctt.ccp.cones import Cones
 from pctt.ccp.delassus import BlockMap, ColumnMap, GivenMatrix, GivenOperator, rows_of
 
@@ -95,11 +96,11 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: An
         words = _wrong_contacts(r, mu, **data)
     if (data.get("G") is None) == (N is None):
         words = "a cone problem is given by either the map G or the matrix N"
-    velocity, friction = (np.zeros(0), np.zeros(0)) if words else (np.asarray(each, dtype=float) for each in (r, mu))
+    velocity, friction = (np.zeros(0), np.zeros(0)) if words else (np.asarray(r, float), np.asarray(mu, float))
     flat, space = velocity.ndim == 2 and velocity.shape[1] == 2, velocity.ndim == 2 and velocity.shape[1] == 3
     space = space or (velocity.ndim == 1 and velocity.size > 0)
     facts = bool(words), flat, space, friction.ndim == 2, parts == 1, parts > 1
-    _, most = reduced(comm, (), (*facts, *kinds, *(-kind for kind in kinds)))
+    _, most = reduced(comm, (), (*facts, *kinds, *map(neg, kinds)))
     wrong, plane, spatial, elliptic, plain, moments, *every = map(int, most)
     if wrong:
         refuse(comm, words)
@@ -130,6 +131,8 @@ def kind_of(given: Any) -> int:
     other."""
     if given is None:
         return 0
+    if isinstance(given, np.ndarray):
+        return 4 if given.ndim == 2 else 5
     if isinstance(given, PETSc.Object):
         return 1
     if isinstance(given, (BlockRows, CompactRows, ContactMap)):
@@ -177,14 +180,12 @@ def _wrong_contacts(
         ("key", key, [(nc,)]),
         ("compliance", soft, [(), (nc,), (nc, 2)]),
     ):
-        if given is not None and np.shape(given) not in allowed:
+        if given is not None and (found := _shape(given)) not in allowed:
             words = " or ".join(map(str, allowed))
-            return f"{name} has the shape {np.shape(given)}; allowed is {words}, as r has {nc} contacts"
+            return f"{name} has the shape {found}; allowed is {words}, as r has {nc} contacts"
     for name, numbers, least in (("r", velocity, -np.inf), ("mu", friction, 0.0), ("compliance", soft, 0.0)):
-        if np.isfinite(numbers.sum()) and numbers.min(initial=0.0) >= least:
-            continue
-        wrong = np.flatnonzero(~(np.isfinite(numbers) & (numbers >= least)))
-        if len(wrong):  # else it is the sum alone that is too large
+        if not all_from(numbers.ravel(), least):
+            wrong = np.flatnonzero(~(np.isfinite(numbers) & (numbers >= least)))
             per = max(numbers.size // max(nc, 1), 1)
             more = f" and {len(wrong) - 1} more numbers" if len(wrong) > 1 else ""
             kind = "finite numbers" + " >= 0" * (least == 0.0)
@@ -203,8 +204,14 @@ def _wrong_contacts(
     return ""
 
 
+def _shape(given: Any) -> tuple[int, ...]:
+    return given.shape if isinstance(given, np.ndarray) else np.shape(given)
+
+
 def _real(given: Any) -> Array:
     """An array of float64; TypeError for complex numbers."""
+    if isinstance(given, np.ndarray) and given.dtype == float:
+        return given
     if np.iscomplexobj(given):
         raise TypeError("complex numbers")
     return np.asarray(given, dtype=float)

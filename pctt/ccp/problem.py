@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from petsc4py import PETSc
 from dem.compiled import loop
 from dem.contact_map import BlockRows
 from dem.exchange import reduced, refuse
-from pctt.arrays import TINY, Array
+from pctt.arrays import TINY, Array, all_from
 from pctt.ccp import door
 from pctt.ccp.cones import Cones, FrictionCones
 from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, ritz_values, without_dense_columns
@@ -100,21 +101,18 @@ class ConeProblem:
         self.cones = FrictionCones(self.mu) if cones is None else cones
         self.comm, self.key = comm, key
         self._curvature: list[float] = []  # shared with problems of other r
-        self.point = None if point is None else np.concatenate([point] * self.cones.parts)
-        self.compliance = np.zeros(self.r.shape)
-        self.compliance[: self.cones.count] = compliances(compliance, self.cones.count)
+        self.point = point if point is None or self.cones.parts == 1 else np.concatenate([point] * self.cones.parts)
+        self.compliance = compliances(compliance, self.cones.count, len(self.r))
         self.operator = self._given_operator = door.operator_of(comm, len(self.r), contacts.width, N, G, masses)
         if self.units is not None:
             self.operator = door.in_units(comm, self._given_operator, self.units)
         self.contact_map = None if isinstance(self.operator, GivenOperator) else self.operator
-        trace = _diagonals(self._rigid_blocks).sum()  # has squares of all numbers of G
-        known = self.contact_map is not None and np.isfinite(trace)
+        trace = float(_diagonals(self._rigid_blocks).sum())  # has squares of all numbers of G
+        known = self.contact_map is not None and math.isfinite(trace)
         wrong = 0 if known else _not_finite(self._rigid_blocks)
-        unanswered = np.count_nonzero(~(_diagonals(self._rigid_blocks) + self.compliance).any(axis=1))
-        soft = self.compliance.max(initial=0.0) > 0.0
-        here = np.array([wrong, self.cones.count, soft, self.r.size, unanswered, trace])
-        *counts, trace = self.sum(here).tolist()
-        wrong, self.size, soft, rows, self.unanswered = map(int, counts)
+        here = wrong, self.cones.count, *_rows_with(self._rigid_blocks, self.compliance), self.r.size, trace
+        (*counts, trace), _ = reduced(comm, here, ())
+        wrong, self.size, soft, self.unanswered, rows = map(int, counts)
         if wrong:
             self.destroy()
             raise ValueError(f"G has a NaN or an infinite number in {wrong} contacts")
@@ -163,18 +161,18 @@ class ConeProblem:
     def taken(self, what: str, impulse: Any, finite: bool = False) -> Array:
         """Impulses (nc, 3) in the cones from the user's, which may be flat. ValueError on all ranks for another shape,
         and for what are no numbers, or no ``finite`` ones. Collective."""
-        found = none = self.shown(np.zeros(self.r.shape))
-        wrong = ""
+        shape, wrong = (len(self.r), self._width), ""
+        found = np.zeros(shape)
         try:
             found = np.ascontiguousarray(impulse, dtype=float)
         except (TypeError, ValueError) as error:
             wrong = f"{what} of no numbers: {error}"
-        if finite and not np.isfinite(found).all():
+        if finite and not all_from(found.ravel(), -np.inf):
             wrong = f"{what} with a NaN or an infinite number"
-        if found.shape not in (none.shape, (none.size,)):
-            wrong = f"{what} of shape {found.shape}; allowed is {none.shape}"
+        if found.shape not in (shape, (len(self.r) * self._width,)):
+            wrong = f"{what} of shape {found.shape}; allowed is {shape}"
         refuse(self.comm, wrong)
-        return self.in_cones(found.reshape(none.shape))
+        return self.in_cones(found.reshape(shape))
 
     def in_cones(self, impulse: Array) -> Array:
         """Impulses (nc, 3) in the cones from the user's."""
@@ -219,7 +217,9 @@ class ConeProblem:
         natural = 0.0 if moved == 0.0 else math.sqrt(moved) / math.sqrt(whole) if whole > 0.0 else math.inf
         most = closing if closing > opening or math.isnan(closing) else opening  # impulses may be no numbers
         work = 0.0 if energy <= 0.0 else most / energy
-        return Errors(_number(natural), _number(work), _number(speed))
+        if math.isnan(natural + work + speed):
+            return Errors(*map(_number, (natural, work, speed)))
+        return Errors(natural, work, speed)
 
     def natural_residual(self, g: Array, y: Array, coulomb: bool = False) -> float:
         """That of the `errors`."""
@@ -336,7 +336,11 @@ class ConeProblem:
 
     def sum(self, x):
         """Over all ranks, of a number or an array."""
-        return self._reduced(x, MPI.SUM)
+        return x if self.comm.size == 1 else self._reduced(x, MPI.SUM)
+
+    def sums(self, *parts: float) -> Sequence[float]:
+        """Of numbers over all ranks, in one reduction."""
+        return parts if self.comm.size == 1 else self._reduced(np.array(parts, dtype=float), MPI.SUM).tolist()
 
     def min(self, x: float) -> float:
         return self._reduced(x, MPI.MIN)
@@ -355,7 +359,7 @@ class ConeProblem:
         return everywhere if here.ndim else everywhere.item()
 
     def dot(self, x: Array, y: Array) -> float:
-        return self.sum(float(np.vdot(x, y)))
+        return self.sum(float(x.ravel().dot(y.ravel())))
 
     def norm(self, x: Array) -> float:
         return math.sqrt(self.dot(x, x))
@@ -368,28 +372,43 @@ class ConeProblem:
 
     def destroy(self) -> None:
         """Free the PETSc objects now."""
-        for operator in {id(each): each for each in (self.operator, self._given_operator)}.values():
-            operator.destroy()
+        self.operator.destroy()
+        if self._given_operator is not self.operator:
+            self._given_operator.destroy()
         if "N" in self.__dict__:
             self.__dict__.pop("N").destroy()
 
 
-def compliances(compliance: Array | float, contacts: int) -> Array:
-    """The diagonal of C (nc, 3), of so many contacts, from what a `ConeProblem` takes as the compliance."""
-    given = np.asarray(compliance, dtype=float)
+def compliances(compliance: Array | float, contacts: int, rows: int) -> Array:
+    """The diagonal of C (rows, 3), of so many contacts in the first rows, from what a `ConeProblem` takes as the
+    compliance."""
+    out, given = np.zeros((rows, 3)), np.asarray(compliance, dtype=float)
     if given.ndim == 2:
-        return _with_both_tangents(np.ascontiguousarray(given))
-    out = np.zeros((contacts, 3))
-    out[:, 0] = given
+        _put_both_tangents(np.ascontiguousarray(given), out)
+    else:
+        out[:contacts, 0] = given
     return out
 
 
 @loop
-def _with_both_tangents(given: Array) -> Array:
-    out = np.empty((len(given), 3))
+def _put_both_tangents(given: Array, out: Array) -> None:
     for c in range(len(given)):
         out[c, 0], out[c, 1], out[c, 2] = given[c, 0], given[c, 1], given[c, 1]
-    return out
+
+
+@loop
+def _rows_with(blocks: Array, compliance: Array) -> tuple[int, int]:
+    """How many rows (n, 3) of C have compliance, and in how many the diagonal of N is zero, for the rigid blocks
+    (n, 3, 3)."""
+    soft, unanswered = 0, 0
+    for c in range(len(compliance)):
+        gives = False
+        answers = False
+        for k in range(3):
+            gives = gives or compliance[c, k] > 0.0
+            answers = answers or blocks[c, k, k] + compliance[c, k] != 0.0
+        soft, unanswered = soft + gives, unanswered + (not answers)
+    return soft, unanswered
 
 
 def _number(x: float) -> float:

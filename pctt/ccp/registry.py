@@ -84,8 +84,9 @@ SOLVERS = {
 
 def why_refused(type: str, cones: type[Cones]) -> str:
     """In words, why a method cannot take problems with these cones, and which methods can; "" if it can."""
-    able = [name for name, method in SOLVERS.items() if cones in method.cones]
-    return "" if type in able else f"{cones.what}; allowed are {', '.join(able)}"
+    if cones in SOLVERS[type].cones:
+        return ""
+    return f"{cones.what}; allowed are {', '.join(name for name, method in SOLVERS.items() if cones in method.cones)}"
 
 
 def why_no_form(type: str, form: str) -> str:

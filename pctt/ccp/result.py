@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, NamedTuple, Optional
+from typing import TYPE_CHECKING, Any, NamedTuple, Optional
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,12 @@ class Limits:
     fallback: bool = option(True, "where the solver does not converge, another one goes on from its impulses")
     monitor: bool = option(False, "print the iterations and the residual wherever a solver looks at it")
     watch: Optional[Callable[[int, float], None]] = number(None, "it is told both, too, on every rank")
+
+    def but(self, **changes: Any) -> Limits:
+        """The same with other values. (As `dataclasses.replace`, which takes ten times as long.)"""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), **changes)
+        return other
 
     def residual(self, errors: Errors) -> float:
         """What ``tol`` is for: the natural residual, or the closing or opening work, or the closing speed, each in

@@ -33,7 +33,8 @@ def relax(world: World, scene: Scene, settings: Settings) -> None:
     """Push apart the bodies of a world at time zero; collective. OptionError if they have no room."""
     dt, trial = MOMENT * settings.dt, world.trial()
     speed = world.large.velocity.copy()
-    none = {name: np.zeros_like(table) for name, table in vars(world.pairs).items() if name != "touching"}
+    names = [each.name for each in dataclasses.fields(world.pairs) if each.name != "touching"]
+    none = {name: np.zeros_like(getattr(world.pairs, name)) for name in names}
     trial.pairs = dataclasses.replace(world.pairs, **none)  # the stepper makes them rigid
     trial.cell, trial.passages = dataclasses.replace(world.cell, deforms=False), Passages()
     closing = CLOSING * settings.delta / dt if settings.delta else math.inf

@@ -14,7 +14,6 @@ counted (`World.spare`): so many as SPARE, and a SHARE of all iterations, may le
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -24,7 +23,7 @@ from dem.arrays import Floats
 from dem.compiled import loop
 from dem.exchange import reduced
 from dem.model.world import World
-from dem.record.energies import energy
+from dem.record.energies import add_kinetic
 from dem.step.islands import contacts_at_rest
 from dem.step.system import ContactSystem
 from pctt.arrays import Array
@@ -51,7 +50,7 @@ def limits_of(limits: Limits, world: World, system: ContactSystem) -> Limits:
 def _aimed(limits: Limits, world: World, part: float) -> Limits:
     """The same limits with an aim, for bodies with this part of the energy of a free fall."""
     spare = ATTEMPT if part < STILL and world.spare >= ATTEMPT else 0
-    return dataclasses.replace(limits, aim=AIM, spare=spare)
+    return limits.but(aim=AIM, spare=spare)
 
 
 def with_islands(
@@ -61,7 +60,7 @@ def with_islands(
     problem, to which ``solve`` is applied. Collective."""
     if limits.aim < 1.0 or not found.converged:
         return found
-    contacts, part = contacts_at_rest(world, system, _passing(system, _tools(world, system)), SLOW)
+    contacts, part = contacts_at_rest(world, system, _passing(world, system), SLOW)
     (count,), (part,) = reduced(world.comm, (len(contacts),), (part,))
     if not count:
         return found
@@ -89,50 +88,43 @@ def account(world: World, limits: Limits, result: Result) -> None:
 def _kinetic_part(world: World, system: ContactSystem) -> float:
     """The kinetic energy of the bodies over that which a step of free motion would give them; inf where a tool, a belt
     or a flow passes them faster than that. Collective."""
-    grains, large, free = world.grains, world.large, system.free_large
-    moves = bodies.is_dynamic(large).nonzero()[0]
-    driven = large.take(moves)
-    first = float(world.comm.rank == 0)  # all ranks know the large bodies, and processors may round otherwise
-    sums = (
-        energy(grains, world.gravity)[0] + first * energy(driven, world.gravity)[0],
-        falling_energy(grains.mass, grains.velocity, system.free_velocity[: len(grains)])
-        + first * falling_energy(driven.mass, driven.velocity, free[moves]),
-        float(grains.mass.sum() + first * driven.mass.sum()),
-    )
-    (kinetic, fall, mass), _ = reduced(world.comm, sums, ())
+    grains, large = world.grains, world.large
+    own = [(grains, system.free_velocity), (large, system.free_large)][: 1 if world.comm.rank else 2]  # as in a record
+    each = [energies_of_fall(of.quaternion, of.velocity, of.mass, of.inertia, free) for of, free in own]
+    (kinetic, fall, mass), _ = reduced(world.comm, [*map(sum, zip(*each))], ())
     if kinetic >= SLOW * fall:  # so a bed that is stirred pays for two sums
         return np.inf
-    _, (fastest,) = reduced(world.comm, (), (_passing(system, _tools(world, system)).max(initial=0.0),))
+    _, (fastest,) = reduced(world.comm, (), (_passing(world, system).max(initial=0.0),))
     passes = 0.5 * mass * fastest**2 > fall
     return np.inf if passes else float(kinetic / fall)
 
 
 @loop
-def falling_energy(mass: Floats, before: Floats, after: Floats) -> float:
-    """The kinetic energy [J] of the change of the linear velocities of n bodies, from `before` (n, 6) to `after`."""
-    energy = 0.0
+def energies_of_fall(
+    turn: Floats, velocity: Floats, mass: Floats, inertia: Floats, free: Floats
+) -> tuple[float, float, float]:
+    """Of the n bodies of finite mass the kinetic energy [J], that of the changes of their linear velocities to those of
+    a `free` motion (n or more, 6) [J], and their mass [kg]."""
+    kinetic, fall, total = 0.0, 0.0, 0.0
     for n in range(len(mass)):
-        for k in range(3):
-            energy += 0.5 * mass[n] * (after[n, k] - before[n, k]) ** 2
-    return energy
+        if np.isfinite(mass[n]):
+            kinetic, total = add_kinetic(kinetic, turn[n], velocity[n], mass[n], inertia[n]), total + mass[n]
+            for k in range(3):
+                fall += 0.5 * mass[n] * (free[n, k] - velocity[n, k]) ** 2
+    return kinetic, fall, total
 
 
-def _tools(world: World, system: ContactSystem) -> Floats:
-    """The velocities (large, 6) of bodies of prescribed motion; zero of others."""
-    tools = system.free_large.copy()
-    tools[bodies.is_dynamic(world.large)] = 0.0
-    return tools
-
-
-def _passing(system: ContactSystem, tools: Floats) -> Floats:
-    """The greatest component (nc,) [m/s] of the velocity that tools with the velocities (large, 6), belts and the flow
-    of a cell have at each contact."""
+def _passing(world: World, system: ContactSystem) -> Floats:
+    """The greatest component (nc,) [m/s] of the velocity that tools, which are bodies of prescribed motion, belts and
+    the flow of a cell have at each contact."""
     at_contacts = [known for known in (system.surface, system.drift) if known is not None]
+    tools, most = system.free_large, np.zeros(len(system.contacts))
+    if world.large_moves:
+        tools = np.where(bodies.is_dynamic(world.large)[:, None], 0.0, tools)
     if tools.any():
         table = np.zeros(system.near.bodies.velocity.shape)
         table[len(table) - len(tools) :] = tools
         at_contacts.append(system.contact_map.relative_velocities(table))
-    most = np.zeros(len(system.contacts))
     for known in at_contacts:
         most = np.maximum(most, np.abs(known).max(axis=1, initial=0.0))
     return most

@@ -79,7 +79,8 @@ def _facts(scene: Scene) -> tuple[str, list[Floats]]:
     numbers += [value for body in large for shape in body.shapes for value in placed(shape)]
     numbers += [scene.gravity, *vars(scene.pairs(np.inf)).values(), *(body.surface for body in large)]
     motion = [getattr(body.motion, "__dict__", {}) for body in large]
-    for values in (vars(scene.cell), *motion, *(given for *_, given in named)):
+    cell = {each.name: getattr(scene.cell, each.name) for each in dataclasses.fields(scene.cell)}
+    for values in (cell, *motion, *(given for *_, given in named)):
         numbers += values.values()
     return repr(words), [np.asarray(value) for value in numbers if _numeric(value)]
 
@@ -380,7 +381,7 @@ def _settle(
     with Stepper(loose, world, memory) as stepper:
         while world.step < end:
             if world.step + 1 >= end - end // 10:
-                stepper.settings = dataclasses.replace(loose, delta=at_rest, tol=0.1 * tol)
+                stepper.use(dataclasses.replace(loose, delta=at_rest, tol=0.1 * tol))
             made = stepper.step()
             stepper.take(made)
             line = made.figures

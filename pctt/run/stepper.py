@@ -21,7 +21,7 @@ from dem.step import Step, advance, carried, find_overrun, find_turned
 from dem.step.fast import refuse_passages
 from dem.step.impacts import in_order
 from dem.step.impulses import ImpulseMemory
-from dem.step.system import ContactSystem, contact_frames
+from dem.step.system import ContactSystem
 from dem.together import SceneError
 from dem.unconstrained import unconstrained
 from pctt import ccp, log
@@ -65,12 +65,17 @@ class Stepper:
         newton: ccp.Newton | None = None,
         dump: Dump | None = None,
     ):
-        self.settings, self.world, self.memory, self.newton, self.dump = settings, world, memory, newton, dump
+        self.world, self.memory, self.newton, self.dump = world, memory, newton, dump
+        self.use(settings)
         self._slabs: Ints | None = None  # those of the last step, whose impulses the memory has
         if settings.stiffness is not None:
             world.pairs.stiffness[:] = settings.stiffness
         if world.cell.deforms and not np.isfinite(world.pairs.stiffness).all():
             raise OptionError("stiffness inf: a cell of given stress needs contacts that give way; allowed is less")
+
+    def use(self, settings: Settings) -> None:
+        """Make the next steps by these settings."""
+        self.settings, self._limits = settings, settings.limits
 
     def __enter__(self) -> Stepper:
         return self
@@ -147,16 +152,15 @@ class Stepper:
     def _recalled(self, world: World, contacts: Contacts) -> tuple[Array, Array]:
         """The impulses (parts nc, 3) of the last step of these contacts, and what laws kept of them (nc, columns)."""
         elsewhere = self._slabs is not world.slabs
-        impulse, _, kept = self.memory.recall(contacts.key, contact_frames(contacts.normal), elsewhere)
+        impulse, _, kept = self.memory.recall(contacts.key, contacts.frame, elsewhere)
         return impulse, kept
 
     def _solved(
         self, world: World, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, before: ccp.Result | None
     ) -> ccp.Result:
         """The solution of a problem of the step as the settings say, with what that `before` has cost."""
-        settings = self.settings
         with log.phase("solve"):
-            limits = rest.limits_of(settings.limits, world, system)
+            limits = rest.limits_of(self._limits, world, system)
             result = self._by(problem, guess, limits, self.newton)
             rest.account(world, limits, result)
             result = rest.with_islands(world, system, problem, guess, limits, self._by_itself, result)
@@ -180,7 +184,7 @@ class Stepper:
         times a step with those that overlap at its end because bodies turn, by a tenth of delta: and how often now."""
         settings, contacts, free = self.settings, system.contacts, system.motion
         delta, recovery = settings.delta, settings.recovery_speed
-        left = settings.dt * settings.limits.closing_speed  # what a solution may leave of an overlap
+        left = settings.dt * self._limits.closing_speed  # what a solution may leave of an overlap
         deep = max(0.01 * delta, left if left < np.inf else 0.0)
         wider = find_overrun(world, free, contacts, velocity, delta, deep, recovery)
         if wider is not None:
@@ -197,8 +201,10 @@ class Stepper:
         self, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, result: ccp.Result
     ) -> dict[str, Any]:
         """The entries of the figures for the files of the problem, if it is written."""
+        if self.dump is None:
+            return {}
         with log.phase("output"):
-            return self.dump.step(system, problem, guess, result, result.asked or result) if self.dump else {}
+            return self.dump.step(system, problem, guess, result, result.asked or result)
 
     def _figures(self, world: World, contacts: int, result: ccp.Result, files: dict[str, Any]) -> dict[str, Any]:
         """The line of a step in steps.jsonl."""
@@ -241,7 +247,7 @@ def _remembered(world: World, system: ContactSystem, found: ccp.Result) -> Impul
 def _locks(world: World, result: ccp.Result) -> bool:
     """Whether no impulses let bodies bounce as they are to, so that their impacts are to be without friction: in a
     corner it may press a body on one wall as fast as the other sends it off."""
-    return result.status is ccp.Status.UNBOUNDED and bool(world.pairs.restitution.any())
+    return result.status is ccp.Status.UNBOUNDED and world.pairs.bounces
 
 
 def _refuse_squeezed(world: World, result: ccp.Result) -> None:

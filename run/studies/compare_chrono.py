@@ -46,13 +46,14 @@ from shared import Row, Table, keep_to_one_core, listed, medians, parser, record
 from dem import quaternion
 from dem.bodies import SPHERE
 from dem.contact import Contacts, find_contacts
+from dem.contact.search import contact_frames
 from dem.contact_map import ContactMap
 from dem.model.world import World
 from dem.motion import Fixed
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
-from dem.step.system import ContactSystem, contact_frames
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 from pctt import ccp
 from pctt.scenes import Mixer

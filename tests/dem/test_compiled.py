@@ -23,9 +23,9 @@ from dem.bodies import SPHERE
 from dem.compiled import inlined, inner, loop
 from dem.contact import broad
 from dem.contact.narrow import Spheres, sphere_sphere
+from dem.contact.search import contact_frames
 from dem.contact.spheres import touch_spheres
 from dem.free_motion import free_spin
-from dem.step.system import contact_frames
 
 
 def sorted_rows(pairs):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from dem.contact.search import contact_frames
 from dem.step.impulses import ImpulseMemory
-from dem.step.system import contact_frames
 
 RNG = np.random.default_rng(3)
 

@@ -16,6 +16,7 @@ from dem.contact import find_contacts
 from dem.experiment import Experiment
 from dem.model.partition import rebalance
 from dem.motion import Glide, Guided, Hinged
+from dem.record.energies import energy
 from dem.scene import Scene
 from dem.shapes import Plane, Sphere
 from dem.start import new_world
@@ -104,7 +105,7 @@ def test_drives_do_the_work_that_the_bodies_have_afterwards(motion, work):
 def test_the_balance_of_a_heap_closes_whatever_the_impulses():
     world = new_world(heap(boxes=False), SELF)
     dt = 0.005
-    before = sum(sum(record.energy(table, world.gravity)) for table in (world.grains, world.large))
+    before = sum(sum(energy(table, world.gravity)) for table in (world.grains, world.large))
     for _ in range(10):
         old = np.concatenate([world.grains.velocity, world.large.velocity[3:]])
         step = made(world, dt=dt)

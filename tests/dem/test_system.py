@@ -9,10 +9,11 @@ from mpi4py import MPI
 
 from dem import bodies, quaternion
 from dem.contact import find_contacts
+from dem.contact.search import contact_frames
 from dem.scene import Scene
 from dem.start import new_world
 from dem.step import advance
-from dem.step.system import ContactSystem, contact_frames
+from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 
 SELF = MPI.COMM_SELF

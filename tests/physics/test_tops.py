@@ -174,7 +174,7 @@ def test_bodies_get_the_angular_momentum_of_their_impacts():
     for _ in range(10):
         sim.step()
         step = sim.last
-        given += step.system.contact_map.sums_of_impulses(step.impulse, np.arange(len(step.impulse)))[:, 3:]
+        given += step.system.contact_map.sums_of_impulses(step.impulse)[:, 3:]
     assert np.abs(given).max() > 0.1
     np.testing.assert_allclose(momenta() - begin, given, atol=1e-9)
 

@@ -12,7 +12,7 @@ from several_ranks import alone
 
 from dem import quaternion
 from dem.contact import find_contacts
-from dem.record import energy
+from dem.record.energies import energy
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world

@@ -105,6 +105,7 @@ def test_ctrl_c_in_a_step_leaves_the_state_before_it(monkeypatch, where):
 
 
 def test_ctrl_c_while_files_are_written_waits_for_them(monkeypatch, tmp_path):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs begin without
     sim, other = begun(), begun()
     sim.write(tmp_path / "run")
     record = sim.output.record

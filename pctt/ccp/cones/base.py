@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pctt.arrays import Array
+from pctt.arrays import Array, all_from
 from pctt.ccp.cones.lorentz import LorentzForm, joined, rows, step_inside
 
 
@@ -24,12 +25,14 @@ class Cones(ABC):
     ----------
     mu : (count,) coefficients of friction
     count : contacts
+    parts : rows of a contact
     tangents : of each part, which numbers of a contact it has
     what : in words, what a problem with them has
     """
 
     mu: Array
     count: int
+    parts: int
     tangents: tuple[tuple[int, ...], ...]
     what: str
 
@@ -38,17 +41,12 @@ class Cones(ABC):
     def coefficients(self) -> Array:
         """Those of the parts (k, count)."""
 
-    @property
-    def parts(self) -> int:
-        """Rows of a contact."""
-        return (1 + sum(map(len, self.tangents))) // 3
-
     def why_refused(self) -> str:
         """What is wrong with the coefficients, in words; else ""."""
         for name, values in self.named():
-            if np.shape(values) != (self.count,):
-                return f"{name} has the shape {np.shape(values)}; allowed is {(self.count,)}, one for each contact"
-            if not np.isfinite(values).all() or np.min(values, initial=0.0) < 0.0:
+            if values.shape != (self.count,):
+                return f"{name} has the shape {values.shape}; allowed is {(self.count,)}, one for each contact"
+            if not all_from(values, 0.0):
                 bad = np.flatnonzero(~(np.isfinite(values) & (np.asarray(values) >= 0.0)))
                 return f"{name} is {values[bad[0]]} at contact {bad[0]}; allowed are finite numbers >= 0"
         return ""
@@ -128,8 +126,8 @@ class Cones(ABC):
     @abstractmethod
     def errors(
         self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None
-    ) -> tuple[Array, float]:
-        """||`move`||^2, |g|^2, closing work, opening work and 1/2 g.(y - r) of this rank's contacts (5,), and the
+    ) -> tuple[Sequence[float], float]:
+        """||`move`||^2, |g|^2, closing work, opening work and 1/2 g.(y - r) of this rank's contacts, and the
         greatest speed at which one closes. ``units`` (2, rows, 3) multiply g and y."""
 
     def active(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:

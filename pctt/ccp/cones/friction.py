@@ -9,6 +9,8 @@ arrays of single precision stay in it. They are exact in double precision too.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,7 @@ from dem.compiled import PART, inlined, loop, prange
 from pctt.arrays import Array, tangential
 from pctt.ccp.cones.base import Cones, floats
 
+_NONE = np.empty((0, 0, 3))
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to the next
 NO_MOVE = 64.0 * float(np.finfo(float).eps) ** 2  # (8 eps)^2: |move|^2 / |step y|^2 that rounding makes
@@ -57,8 +60,10 @@ def active(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDArra
 
 
 @loop
-def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float, units: Array) -> tuple[Array, Array]:
-    """Sums (5, STRIP) over some of the contacts each, and the greatest -y_n (STRIP,) of these, or 0.
+def errors(
+    x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float, units: Array
+) -> tuple[tuple[float, float, float, float, float], float]:
+    """Five sums over the contacts, and the greatest -y_n, or 0.
 
     The sums are of |P(x - step y) - x|^2, where y gets the term (mu |y_t|, 0, 0) of De Saxce if ``de_saxce`` is 1, and
     below the rounding of step y it is zero: a contact that slides has 0 = P(-step y) only up to that; of |x|^2; and
@@ -78,7 +83,23 @@ def errors(x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float
             g[: b - a], v[: b - a] = x[a:b], y[a:b]
         _add_moves(g, v, step, friction, de_saxce, sums[0])
         _add_works(g, v, r[a:b], len(friction), sums[1], sums[2], sums[3], sums[4], most)
-    return sums, most
+    greatest = 0.0
+    for k in range(STRIP):
+        greatest = most[k] if most[k] > greatest or most[k] != most[k] else greatest
+    return (_sum(sums[0]), _sum(sums[1]), _sum(sums[2]), _sum(sums[3]), _sum(sums[4])), greatest
+
+
+@loop
+def _sum(x):
+    """The sum of STRIP numbers, of eight side by side in each half."""
+    total, half = 0.0, STRIP // 2
+    for first in range(0, STRIP, half):
+        s = x[first : first + 8].copy()
+        for a in range(first + 8, first + half, 8):
+            for k in range(8):
+                s[k] += x[a + k]
+        total += ((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7]))
+    return total
 
 
 @loop
@@ -267,7 +288,7 @@ def project(x: Array, mu: Array, out: Array | None = None) -> Array:
 class FrictionCones(Cones):
     """The cones |g_t| <= mu g_n hold the impulses of contacts with friction ``mu`` (count,)."""
 
-    tangents, what = ((1, 2),), "friction"
+    parts, tangents, what = 1, ((1, 2),), "friction"
 
     def __init__(self, mu: Array):
         self.mu = floats(mu)
@@ -299,10 +320,10 @@ class FrictionCones(Cones):
 
     def errors(
         self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None
-    ) -> tuple[Array, float]:
-        units = np.empty((0, *r.shape)) if units is None else units
-        sums, most = errors(g, y, r, step, self.mu, float(coulomb), units)
-        return sums.sum(axis=1), float(most.max())
+    ) -> tuple[Sequence[float], float]:
+        found: tuple[Sequence[float], float]
+        found = errors(g, y, r, step, self.mu, float(coulomb), _NONE if units is None else units)
+        return found
 
     def active(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
         return active(x, last_x, y, self.mu, least)

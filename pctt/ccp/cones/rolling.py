@@ -16,6 +16,8 @@ Arrays of contacts are (2 nc, 3): (normal, tangents) of all contacts, then (spin
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,7 +41,7 @@ class RollingCones(Cones):
     """The cones hold impulses and moments of contacts with coefficients (count,): ``mu`` of friction, ``rolling`` and
     ``spinning``, of which the last two are lengths over those of the contacts."""
 
-    tangents, what = ((1, 2), (4, 5), (3,)), "rolling or spinning resistance"
+    parts, tangents, what = 2, ((1, 2), (4, 5), (3,)), "rolling or spinning resistance"
 
     def __init__(self, mu: Array, rolling: Array, spinning: Array):
         self.mu, self.rolling, self.spinning = (floats(each) for each in (mu, rolling, spinning))
@@ -67,7 +69,7 @@ class RollingCones(Cones):
     @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
     def errors(
         self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None
-    ) -> tuple[Array, float]:
+    ) -> tuple[Sequence[float], float]:
         g, y = (g, y) if units is None else (g * units[0], y * units[1])
         both = self.move(g, y, step, coulomb), step * y
         move, speed = (np.square(z).sum(axis=1).reshape(2, -1).sum(axis=0) for z in both)
@@ -75,7 +77,7 @@ class RollingCones(Cones):
         power = (g * y).sum(axis=1).reshape(2, -1).sum(axis=0)
         closing = np.maximum(-normal, 0.0)
         works = push @ closing, np.maximum(power, 0.0).sum(), 0.5 * np.vdot(g, y - r)
-        sums = np.array([move[~(move <= NO_MOVE * speed)].sum(), np.vdot(g, g), *works])
+        sums = [float(each) for each in (move[~(move <= NO_MOVE * speed)].sum(), np.vdot(g, g), *works)]
         return sums, float(closing.max(initial=0.0))
 
     def de_saxce(self, y: Array) -> Array:

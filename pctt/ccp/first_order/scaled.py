@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -62,8 +64,7 @@ class ScaledProblem:
     def __init__(self, problem: ConeProblem, coulomb: bool = False, precision: type[np.floating] = np.float64):
         self.problem, self.coulomb, self.precision = problem, coulomb, precision
         shape = problem.r.shape
-        largest = problem.max(max(float(problem.r.max(initial=0.0)), -float(problem.r.min(initial=0.0))))
-        self.unit = 2.0 ** np.frexp(largest)[1]
+        self.unit = 2.0 ** math.frexp(problem.max(_largest(problem.r)))[1]
         self.shrink, self._units = np.empty(shape), np.empty((2, *shape))  # the diagonal of S^-1; of x, of a gradient
         self._impulse, self._velocity = self._units
         self.b, self._compliance = np.empty((2, *shape), precision)
@@ -123,8 +124,9 @@ class ScaledProblem:
         """The iterates with all contacts, memory for a new one, and memory (nc, 3) for a gradient."""
         rows, self._active = self._active.rows, self._all
         if rows is not None:
-            now, last = (self._scattered(iterate, rows) for iterate in (now, last))
-        return now, last, Iterate(np.empty_like(now.x), new.image), np.empty_like(now.x)
+            now, last = self._scattered(now, rows), self._scattered(last, rows)
+        x, y = np.empty((2, *self.b.shape), self.b.dtype)
+        return now, last, Iterate(x, new.image), y
 
     def _scattered(self, iterate: Iterate, rows: Rows) -> Iterate:
         x = np.zeros_like(self.b)
@@ -154,16 +156,16 @@ class ScaledProblem:
         assert isinstance(every.operator, ContactMap)
         operator, cones = every.operator.only(contacts), self.cones.only(contacts)
         self._active = ActiveSet(rows, operator, cones, active(every.b), active(every.compliance))
-        return now, last, Iterate(np.empty_like(y), new.image), y
+        return now, last, Iterate(np.empty(y.shape, y.dtype), new.image), y
 
-    def step(self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate) -> list[float]:
+    def step(self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate) -> Sequence[float]:
         """The projected step of this length from z, where the rigid gradient is y, into ``new``; of the step d from z
         d'Ad and |d|^2, and y_z'(x_new - x), with y_z the gradient at z with the De Saxce term of Coulomb's law."""
         _, operator, cones, _, soft = self._active
         work, square, uphill = cones.accelerated_step(now.x, last.x, y, soft, beta, length, self.coulomb, new.x)
         operator.find_image(*new)
         work += operator.energy_of_step(new.image, now.image, last.image, beta)
-        return self.sums(work, square, uphill).tolist()
+        return self.problem.sums(work, square, uphill)
 
     def project(self, x: Array) -> Array:
         """x moved to the nearest point of the cones, in place."""
@@ -199,6 +201,16 @@ class ScaledProblem:
             curvature = self.dots((x, Ax))[0] / norm
             x = Ax
         return max(curvature, 1.0)  # the mean of diag A is 1
+
+
+@loop
+def _largest(r):
+    """The greatest size of a number of r (nc, 3)."""
+    largest = 0.0
+    for c in range(len(r)):
+        for k in range(3):
+            largest = max(largest, abs(r[c, k]))
+    return largest
 
 
 @loop
@@ -242,6 +254,7 @@ class Progress:
     def __init__(self, problem: ScaledProblem, limits: Limits, options: FirstOrder, before: Progress | None = None):
         """``before`` is the progress in lower precision, whose iterations and history go on."""
         self.problem, self.limits, self.check, self.patience = problem, limits, options.check, options.patience
+        self._aimed = limits.aimed
         self.iterations: int = before.iterations if before else 0
         self.history: list[float] = before.history if before else []
         self.status, self.reason = Status.STALLED, ""
@@ -260,7 +273,7 @@ class Progress:
 
         Before there was a step it is taken for RATIO times |L step| / |x|."""
         residual, size_then = self._last_look
-        wanted = self.limits.tol if self._met is None else self.limits.aimed
+        wanted = self.limits.tol if self._met is None else self._aimed
         early = self._next_look - self.check + 3
         if self.iterations >= early and residual * size <= 0.9 * wanted * size_then:
             self._next_look = self.iterations
@@ -283,7 +296,7 @@ class Progress:
         if self._size > 0:
             self._last_look = (residual, self._size)
         else:
-            self._last_look = (RATIO, float(np.sqrt(self.problem.dots((x, x))[0])))
+            self._last_look = (RATIO, self.problem.problem.norm(x))
         self.status, self.reason = self._why_stop(residual)
         return not self.reason
 
@@ -317,7 +330,9 @@ class Progress:
                 return residual
         g, problem = self.problem.impulse(x), self.problem.problem
         y = problem.product(g) + problem.r  # in double precision
-        return self._judge(problem.errors(g, y, self.problem.coulomb), x) if np.isfinite(problem.dot(g, y)) else np.nan
+        if not math.isfinite(problem.dot(g, y)):
+            return math.nan
+        return self._judge(problem.errors(g, y, self.problem.coulomb), x)
 
     def _judge(self, errors: Errors, x: Array) -> float:
         """The residual that the tolerance is for. Where only the closing work is too large, the problem may have no
@@ -335,11 +350,11 @@ class Progress:
         if self._lowest < -ROUNDED and not self._unbounded:
             words = f"N is indefinite: d'Nd / d'd is {self._lowest:.1g} of the greatest for a step d"
             return Status.BREAKDOWN, words
-        if residual <= self.limits.aimed or (self._met is not None and self.beyond >= self.limits.spare):
+        if residual <= self._aimed or (self._met is not None and self.beyond >= self.limits.spare):
             return Status.CONVERGED, self.limits.met
         if self._unbounded:
             return Status.UNBOUNDED, self._unbounded
-        if np.isnan(residual):
+        if residual != residual:
             return Status.BREAKDOWN, f"not a number after {self.iterations} iterations"
         if self.iterations >= self.limits.max_it:
             return Status.ITERATION_LIMIT, f"{self.iterations} iterations"
