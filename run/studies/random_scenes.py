@@ -424,6 +424,8 @@ def overlaps(made: Mixture, sim: pctt.Simulation, lines: list[Row]) -> list[Note
         reason = "springs or given forces press more than the chosen stiffness foresees, as the run says"
     elif springs and made.squeezed:
         reason = "tools of prescribed motion, or joints to the world, squeeze whatever forces that takes"
+    elif np.abs(sim.local.velocity[:, 3:]).max(initial=0.0) * sim.settings.dt > 1.0:
+        reason = "bodies turn by radians in a step, of which the run warns"
     return [Note(f"an overlap of {deepest:.2g} radii of the smallest grains", reason)]
 
 
