@@ -12,7 +12,7 @@ from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
 from dem.compiled import inlined, loop
-from dem.contact.ahead import Course, Forms, Poses, guest_is_second, seen_from, turn_ahead
+from dem.contact.ahead import Course, Forms, Poses, guest_is_second, seen_from, turn_ahead, vector_of
 from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.convex import (
     Solids,
@@ -50,6 +50,7 @@ from dem.contact.polyhedra import (
 )
 from dem.contact.solid_meshes import NAMES, solid_mesh
 from dem.contact.spheres import touch_spheres
+from dem.geometry.vectors import turned
 from dem.mesh import Mesh, Surface
 from dem.motion import Dynamic
 from dem.shapes import CONVEX_SHAPES, Shape, placed
@@ -290,12 +291,14 @@ def with_parts(first, row, kind, bodies, parts):
     """Centres (n, 3), quaternions (n, 4) and sizes (n, 3) of shapes, of which those before the `first` part are the
     `bodies` in the same rows; each of the `parts`, which are in the frames of the bodies in their `row` (n,), goes with
     its body, and the normals of half spaces turn."""
-    (position, turns, sizes), (offset, turned, extent) = bodies, parts
-    center, turn, size = np.empty(offset.shape), np.empty(turned.shape), np.empty(extent.shape)
+    (position, turns, sizes), (offset, own, extent) = bodies, parts
+    center, turn, size = np.empty(offset.shape), np.empty(own.shape), np.empty(extent.shape)
     center[:first], turn[:first], size[:first] = position[:first], turns[:first], sizes[:first]
     for n in range(first, len(row)):
-        p, q = turns[row[n]], turned[n]
-        moved, sized = rotated(p, offset[n]), rotated(p, extent[n])
+        p, q = turns[row[n]], own[n]
+        axis, twice = vector_of(p, 1), 2.0 * p[0]
+        moved = turned(vector_of(offset[n], 0), axis, twice, 2.0)
+        sized = turned(vector_of(extent[n], 0), axis, twice, 2.0)
         for k in range(3):
             center[n, k] = position[row[n], k] + moved[k]
             size[n, k] = sized[k] if kind[n] == PLANE else extent[n, k]
@@ -304,18 +307,6 @@ def with_parts(first, row, kind, bodies, parts):
         turn[n, 2] = p[0] * q[2] + q[0] * p[2] + (p[3] * q[1] - p[1] * q[3])
         turn[n, 3] = p[0] * q[3] + q[0] * p[3] + (p[1] * q[2] - p[2] * q[1])
     return center, turn, size
-
-
-@inlined
-def rotated(q, v):
-    """A vector turned by a quaternion."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    a, b, c = y * v[2] - z * v[1], z * v[0] - x * v[2], x * v[1] - y * v[0]
-    return (
-        v[0] + 2.0 * (w * a + (y * c - z * b)),
-        v[1] + 2.0 * (w * b + (z * a - x * c)),
-        v[2] + 2.0 * (w * c + (x * b - y * a)),
-    )
 
 
 @loop
