@@ -121,6 +121,13 @@ def random_scenes(monkeypatch):
     return __import__("random_scenes")
 
 
+def overlapping(cause: str, turn: float = 0.0) -> SimpleNamespace:
+    """Return what the study reads of a run with overlaps of ``cause`` and bodies that turn by ``turn`` [rad] a step."""
+    velocity = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, -turn / 0.1]])
+    local, settings = SimpleNamespace(velocity=velocity), SimpleNamespace(dt=0.1)
+    return SimpleNamespace(overlap_watch=SimpleNamespace(cause=cause), local=local, settings=settings)
+
+
 def test_notes_of_random_scenes_tell_faults_from_what_is_known(monkeypatch):
     """Steps that are not solved, deep overlaps, energy from nothing, and ends of runs."""
     study = random_scenes(monkeypatch)
@@ -137,10 +144,10 @@ def test_notes_of_random_scenes_tell_faults_from_what_is_known(monkeypatch):
     for counts, known in (((1, 19), True), ((3, 17), False)):
         (note,) = study.solves(hard, [stalled] * counts[0] + [figures] * counts[1])
         assert bool(note.reason) == known
-    by = {cause: SimpleNamespace(overlap_watch=SimpleNamespace(cause=cause)) for cause in ("stiffness", "dt")}
-    assert study.overlaps(bare, by["stiffness"], [{"worst_overlap": 1e-4}]) == []
-    for made, cause, known in ((bare, "stiffness", False), (pressed, "stiffness", True), (pressed, "dt", False)):
-        (note,) = study.overlaps(made, by[cause], [{"worst_overlap": 0.02}])
+    assert study.overlaps(bare, overlapping("stiffness"), [{"worst_overlap": 1e-4}]) == []
+    overlaps = (bare, "stiffness", 0, False), (pressed, "stiffness", 0, True), (pressed, "dt", 0, False)
+    for made, cause, turn, known in (*overlaps, (bare, "dt", 0.5, False), (bare, "dt", 3.0, True)):
+        (note,) = study.overlaps(made, overlapping(cause, turn), [{"worst_overlap": 0.02}])
         assert bool(note.reason) == known
     energies = [dict(zip(study.STATES, values)) for values in ([3.0, 1.0, 0.0], [2.0, 1.5, 0.0], [2.5, 1.5, 0.0])]
     assert study.energies(energies[:2], False, 0.1) == study.energies(energies, True, 0.1) == []
