@@ -39,7 +39,7 @@ from dem.parts.passages import Outlet, Passages
 from dem.parts.sources import Source
 from dem.parts.springs import Spring
 from dem.quaternion import across, length
-from dem.shapes import Clump, Shape, clumps, convex, polyhedra
+from dem.shapes import Clump, Shape, clumps, convex, polyhedra, refuse_other_than_shapes
 from dem.shapes.convex import Convex
 from dem.shapes.forms import Form
 
@@ -422,6 +422,7 @@ class Scene:
             raise ValueError(f"large bodies need distinct names, got {name!r}")
         if not isinstance(shapes, Iterable) or not (shapes := tuple(shapes)):
             raise ValueError(f"shapes of {name!r}: {shapes!r}; allowed is a list of one or more")
+        refuse_other_than_shapes(name, shapes)
         if isinstance(motion, type):
             raise ValueError(f"motion of {name!r}: the class {motion.__name__}; allowed is one, {motion.__name__}(...)")
         place = checks.vector(f"position of {name!r}", position)

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from dem.experiment import Experiment as Experiment
     from dem.experiment import option as option
     from dem.measures import Block as Block
-    from dem.measures import Cylinder as Cylinder
     from dem.mesh import Mesh as Mesh
     from dem.motion import Dynamic as Dynamic
     from dem.motion import Fixed as Fixed
@@ -40,8 +39,10 @@ if TYPE_CHECKING:
     from dem.shapes import Box as Box
     from dem.shapes import Capsule as Capsule
     from dem.shapes import Clump as Clump
+    from dem.shapes import Cylinder as Cylinder
     from dem.shapes import Plane as Plane
     from dem.shapes import Sphere as Sphere
+    from dem.shapes import Superellipsoid as Superellipsoid
     from pctt.beds import read_spheres as read_spheres
     from pctt.folder import Folder as Folder
     from pctt.simulation import Settings as Settings
@@ -54,13 +55,13 @@ __version__ = "0.4.0"
 _HOMES = {
     "dem": "measures",
     "dem.experiment": "Experiment option",
-    "dem.measures": "Block Cylinder",
+    "dem.measures": "Block",
     "dem.mesh": "Mesh",
     "dem.motion": "Dynamic Fixed Glide Guided Held Hinged Oscillation Path Rotation",
     "dem.packing": "perturbed random_packing",
     "dem.parts.sizes": "Uniform",
     "dem.scene": "Scene",
-    "dem.shapes": "Box Capsule Clump Plane Sphere",
+    "dem.shapes": "Box Capsule Clump Cylinder Plane Sphere Superellipsoid",
     "pctt.beds": "read_spheres",
     "pctt.folder": "Folder",
     "pctt.simulation": "Settings Simulation",

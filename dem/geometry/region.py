@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Union
+from typing import Any, Union, get_args
 
 import numpy as np
 
@@ -116,3 +116,11 @@ class Cylinder:
 
 
 Region = Union[Block, Cylinder]
+
+
+def refuse_region(what: str, region: Any, *allowed: type) -> None:
+    """Raise ValueError for what is no region, or none of those that are `allowed`."""
+    kinds = allowed or get_args(Region)
+    if not isinstance(region, kinds):
+        names = " or a ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"region of {what}: allowed is a {names} of pctt.measures, got {region!r}")

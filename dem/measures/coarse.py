@@ -10,7 +10,7 @@ import numpy as np
 from dem.arrays import Floats
 from dem.checks import counts, positive
 from dem.compiled import loop
-from dem.geometry.region import Block
+from dem.geometry.region import Block, refuse_region
 from dem.measures.grains import branches, ends
 from dem.measures.sample import Sample, summed
 
@@ -37,7 +37,8 @@ def fields(sample: Sample, region: Block, cells: Sequence[int], width: float, ke
     `width` [m]: of the kernel "lucy" its range; of "gauss" the standard deviation, and it is cut at three of these
     and normalised. The integral of a contact's force along its branch takes three Gauss points on every branch.
     Source: Goldhirsch (2010), Granular Matter 12, 239-252; Weinhart et al. (2012), Granular Matter 14, 289-294.
-    ValueError for a bad kernel, width or number of cells."""
+    ValueError for another region, a bad kernel, width or number of cells."""
+    refuse_region("fields", region, Block)
     positive("width of the kernel", width)
     if kernel not in KERNELS:
         raise ValueError(f"kernel {kernel!r}: allowed is one of {', '.join(KERNELS)}")

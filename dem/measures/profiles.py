@@ -10,7 +10,7 @@ import numpy as np
 
 from dem.arrays import ArrayLike, Bools, Floats
 from dem.checks import counts, unit_vector
-from dem.geometry.region import Block
+from dem.geometry.region import Block, refuse_region
 from dem.measures.sample import Sample, summed
 
 
@@ -74,6 +74,7 @@ def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> 
     With p the fraction of them among all, and s^2 the variance of the fractions in the cells, each with the weight of
     its grains: Lacey's index is (p (1 - p) - s^2) / (p (1 - p) - p (1 - p) / m) for cells of m grains on average that
     are not empty. NaN if there is one kind alone, or one grain per cell."""
+    refuse_region("mixing", region, Block)
     shape, (low, high), mask = counts("cells", cells), region.bounds, sample.marked(mask)
     rows, position, _ = sample.grains_in(low, high)
     inside = region.contains(position)

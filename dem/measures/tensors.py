@@ -8,7 +8,7 @@ from dem.arrays import Bools, Floats
 from dem.bodies import SPHERE
 from dem.checks import positive
 from dem.compiled import loop
-from dem.geometry.region import Block, Cylinder, Region
+from dem.geometry.region import Block, Cylinder, Region, refuse_region
 from dem.measures.grains import bearing, branches, ends
 from dem.measures.images import images
 from dem.measures.sample import Sample, summed
@@ -44,7 +44,8 @@ def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None 
 
 def fabric(sample: Sample, region: Region) -> Floats:
     """Return the fabric tensor (3, 3): the mean of n n over the contacts that bear force and have their points in the
-    region; its trace is 1, and 0 if there are no such contacts."""
+    region; its trace is 1, and 0 if there are no such contacts. ValueError for a mask."""
+    refuse_region("a fabric tensor", region)
     bears = np.flatnonzero(bearing(sample))
     row, step = images(sample.point[bears], sample.lattice, *region.bounds)
     inside = region.contains(sample.point[bears[row]] + step @ sample.lattice)
@@ -56,7 +57,8 @@ def fabric(sample: Sample, region: Region) -> Floats:
 def solid_fraction(sample: Sample, region: Region) -> float:
     """Return the volume of the grains in a region over its volume. Spheres that the faces of a Block cut count with the
     part inside, to 1e-3 of a sphere where several faces cut it and exactly where one does; other grains, and all in a
-    Cylinder, count whole if their centre is inside."""
+    Cylinder, count whole if their centre is inside. ValueError for a mask."""
+    refuse_region("a solid fraction", region)
     row, place, _ = sample.grains_in(*region.bounds, float(sample.size[sample.shape == SPHERE, 0].max(initial=0.0)))
     volume = sample.volume[row] * region.contains(place)
     if isinstance(region, Block):

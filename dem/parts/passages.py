@@ -10,8 +10,8 @@ import numpy as np
 
 from dem.arrays import Bools, Floats
 from dem.bodies import Bodies, concatenate, none
-from dem.geometry.region import Block, Cylinder
-from dem.parts.sources import Source, Tally, bounds, refuse_region
+from dem.geometry.region import Block, Cylinder, refuse_region
+from dem.parts.sources import Source, Tally, bounds
 
 #: In scenes with sources grains have ids below this number, and large bodies from it on.
 MOST_IDS = 10**12
@@ -25,7 +25,7 @@ class Outlet:
     outside: bool = False
 
     def __post_init__(self) -> None:
-        refuse_region("outlet", self.region)
+        refuse_region("an outlet", self.region)
 
     def takes(self, position: Floats) -> Bools:
         """Mask (n,) of the centres (n, 3) [m] that leave."""

@@ -15,7 +15,7 @@ import numpy as np
 from dem import checks, quaternion, shapes
 from dem.arrays import Floats, Ints
 from dem.bodies import SPHERE, Bodies, enclosing_radius
-from dem.geometry.region import Block, Cylinder
+from dem.geometry.region import Block, Cylinder, refuse_region
 from dem.motion import Timed
 from dem.parts.named import Named
 from dem.parts.sizes import Listed, Uniform
@@ -51,7 +51,7 @@ class Source(Named, Timed):
 
     def __post_init__(self) -> None:
         self._check_times()
-        refuse_region("source", self.region)
+        refuse_region("a source", self.region)
         if (self.mass_rate is None) == (self.number_rate is None):
             raise ValueError("a source has either a mass_rate [kg/s] or a number_rate [1/s]")
         given = [rate for rate in (self.mass_rate, self.number_rate) if rate is not None]
@@ -193,12 +193,6 @@ def _turns(random: Floats) -> Floats:
     one, two = np.sqrt(1.0 - random[:, 0]), np.sqrt(random[:, 0])
     a, b = 2.0 * np.pi * random[:, 1], 2.0 * np.pi * random[:, 2]
     return np.stack([one * np.sin(a), one * np.cos(a), two * np.sin(b), two * np.cos(b)], axis=1)
-
-
-def refuse_region(what: str, region: Any) -> None:
-    """Raise ValueError for what is no region."""
-    if not isinstance(region, (Block, Cylinder)):
-        raise ValueError(f"region of a {what}: allowed is a Block or a Cylinder of dem.measures, got {region!r}")
 
 
 def reach(table: Bodies) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Union
+from typing import Any, Union, get_args
 
 import numpy as np
 
@@ -89,6 +89,14 @@ class Clump:
             raise ValueError(f"Clump: {len(np.atleast_2d(self.centres))} centres with {len(radii)} radii")
         object.__setattr__(self, "centres", tuple(map(tuple, centres.tolist())))
         object.__setattr__(self, "radii", tuple(radii.tolist()))
+
+
+def refuse_other_than_shapes(name: str, given: Sequence[Any]) -> None:
+    """Raise ValueError if something among the shapes of the body `name` is none."""
+    for shape in given:
+        if not isinstance(shape, get_args(Shape)):
+            names = ", ".join(kind.__name__ for kind in (Plane, Box, Sphere, Capsule, Mesh, *CONVEX_SHAPES))
+            raise ValueError(f"shapes of {name!r}: {shape!r} is none; allowed are {names} of pctt")
 
 
 def described(shape: Shape) -> dict[str, Any]:

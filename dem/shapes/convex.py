@@ -93,7 +93,7 @@ class ConvexForm(Form):
 def form(shape: Convex) -> ConvexForm:
     """The form of a shape of grains; the same object for equal ones. ValueError for what is none."""
     if not isinstance(shape, Convex):
-        raise ValueError(f"shape of grains: allowed are convex shapes such as a Cylinder, got {type(shape).__name__}")
+        raise ValueError(f"shape of grains: allowed are convex shapes such as a pctt.Cylinder, got {shape!r}")
     if tuple(shape.center) != ORIGIN or tuple(shape.quaternion) != UPRIGHT:
         raise ValueError("shape of grains: its center and quaternion must be those of its frame; give positions")
     return centred(shape)

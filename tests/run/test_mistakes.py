@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 
 import pctt
-from pctt import Box, Dynamic, Fixed, Plane, Scene, Simulation
+from pctt import Box, Dynamic, Fixed, Plane, Scene, Simulation, measures
 from pctt.disk import FileError
 from pctt.options import OptionError
 from pctt.scenes import Mixer
@@ -29,11 +29,31 @@ def falling(**law):
     ([Box((1, 1, 1))], "Dynamic", "the motion 'Dynamic': allowed is an object of dem.motion, or one with"),
     (Box((1, 1, 1)), Dynamic(), "shapes of 'b': Box.*; allowed is a list of one or more"),
     ([], Dynamic(), "shapes of 'b': .*; allowed is a list of one or more"),
+    ([measures.Block((0, 0, 0), (1, 1, 1))], Dynamic(), "shapes of 'b': Block.* is none; allowed are Plane, .*, Cyl"),
+    ([Box], Dynamic(), "shapes of 'b': <class .*> is none; allowed are Plane, Box"),
     ([Box((1, 1, 1))], Fixed(), r"density of 'b', which stands still: allowed is a motion, Dynamic\(\) say"),
 ])  # fmt: skip
 def test_a_body_of_a_class_or_of_no_list_is_refused(shapes, motion, words):
     with pytest.raises(ValueError, match=words):
         falling().add_body("b", shapes, motion, density=1000.0)
+
+
+def test_what_is_no_region_is_refused():
+    sim = Simulation(falling(), dt=0.01)
+    sim.step()
+    block, whole = measures.Block((0, 0, 0), (1, 1, 1)), np.ones(2, bool)
+    for wrong in (whole, Box((1, 1, 1)), None):
+        for measure in (measures.fabric, measures.solid_fraction):
+            with pytest.raises(ValueError, match="region of a .*: allowed is a Block or a Cylinder of pctt.measures"):
+                measure(sim.sample, wrong)
+    tube = measures.Cylinder((0, 0, 0), (0, 0, 1), 1.0)
+    with pytest.raises(ValueError, match="region of fields: allowed is a Block of pctt.measures, got Cylinder"):
+        measures.fields(sim.sample, tube, (2, 2, 2), 0.1)
+    with pytest.raises(ValueError, match="region of mixing: allowed is a Block of pctt.measures, got Cylinder"):
+        measures.mixing(sim.sample, whole, tube, (2, 2, 2))
+    with pytest.raises(ValueError, match=r"region of an outlet: allowed .*, got Box\(half_extents"):
+        falling().add_outlet("out", Box((1, 1, 1)))
+    assert measures.mixing(sim.sample, whole, block, (2, 2, 2))
 
 
 def test_an_attribute_that_a_simulation_does_not_have_is_not_set():
