@@ -45,6 +45,7 @@ class EntriesTrain:
     """
 
     single_pays = True
+    idle = {"variant": "it is for sparse matrices"}  #: options that have no effect, and why
     _product: TrainProduct  # by the train of the inverse
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str, places: Places) -> None:
