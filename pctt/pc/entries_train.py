@@ -45,7 +45,6 @@ class EntriesTrain:
     """
 
     single_pays = True
-    idle = {"variant": "it is for sparse matrices"}  #: options that have no effect, and why
     _product: TrainProduct  # by the train of the inverse
 
     def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str, places: Places) -> None:
@@ -61,6 +60,12 @@ class EntriesTrain:
         self.inverse: Inverse | None = None
         self.symmetric = True
         self.failure = self.note = ""
+
+    @property
+    def idle(self) -> dict[str, str]:
+        """Options that have no effect, and why."""
+        none = dict.fromkeys(("eps", "order", "setup_limit"), "there is no train of rank 1") if self.rank == 1 else {}
+        return {"variant": "it is for sparse matrices", **none}
 
     def make(self, A: PETSc.Mat, P: PETSc.Mat) -> bool:
         """Make a preconditioner. False: the diagonal is better, or nothing else worked; `failure` or `note` say why.

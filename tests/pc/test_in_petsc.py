@@ -224,7 +224,14 @@ def test_options_without_an_effect_are_named(options, idle):
     assert [line.split(" has no effect")[0].split()[-1] for line in words] == [f"-a_pc_tt_{name}" for name in idle]
 
 
-def test_a_variant_of_sparse_trains_has_no_effect_on_entries():
-    ksp = solver(stored(ring(20, 1), "dense"), variant="paper", **SMALL)
-    with pytest.warns(UserWarning, match="-pc_tt_variant has no effect: it is for sparse matrices"):
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"variant": "paper", "rank": 20}, "-pc_tt_variant has no effect: it is for sparse matrices"),
+        ({"eps": 1e-3, "rank": 1}, "-pc_tt_eps has no effect: there is no train of rank 1"),
+    ],
+)
+def test_options_without_an_effect_on_entries_are_named(options, words):
+    ksp = solver(stored(ring(20, 1), "dense"), **options)
+    with pytest.warns(UserWarning, match=words):
         ksp.setUp()
