@@ -29,7 +29,7 @@ from pctt.ccp.newton import FORMS, Newton
 from pctt.ccp.newton.compare import Comparison
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.registry import MATRIX, NEWTON, SOLVERS, why_no_form, why_refused
-from pctt.ccp.result import COULOMB, LAWS, RELAXATION, Counts, Limits, Result, Status
+from pctt.ccp.result import COULOMB, FIXED_POINT, LAWS, RELAXATION, Counts, Limits, Result, Status
 from pctt.ccp.unbounded import why_indefinite, why_unanswered, why_unbounded
 from pctt.log import phase
 from pctt.options import instance
@@ -77,7 +77,7 @@ def solve(
     status says that it is not converged. With ``limits.fallback`` false the asked method is alone.
 
     Coulomb's law is found by the method itself if it can (`Solver.has_law`), else by a sequence of cone problems
-    (`pctt.ccp.coulomb`).
+    (`pctt.ccp.coulomb`). If one of these has no solution, the other method decides whether the law has one.
 
     A problem with `RollingCones`, whose impulses are (2 nc, 3), is for `conic`, `apgd` and `auto`. A problem given by a
     `pctt.ccp.Operator` is for all methods but `gauss_seidel`; ValueError for a preconditioner that reads entries.
@@ -108,11 +108,13 @@ def solve(
     result = asked = _by(type, problem, start, limits, options, newton, law)
     other = "conic" if asked.solver == "apgd" else "apgd"
     wrong = asked.status is Status.BREAKDOWN and other == "conic"  # products are no numbers
-    hopeless = asked.final or asked.exhausted or wrong
+    # the law may have a solution where the convex problems of a sequence have none
+    doubtful = asked.status is Status.UNBOUNDED and asked.law == FIXED_POINT
+    hopeless = (asked.final and not doubtful) or asked.exhausted or wrong
     if limits.fallback and not hopeless:
         rest = dataclasses.replace(limits.after(asked.iterations), max_it=-1)
-        second = _by(other, problem, asked.impulse, rest, None, newton, law)
-        better = second.final or second.residual < asked.residual
+        second = _by(other, problem, start if doubtful else asked.impulse, rest, None, newton, law)
+        better = second.final or doubtful or second.residual < asked.residual
         result = second.after(asked) if better else dataclasses.replace(asked).after(second)
         result.asked, result.reason = asked, f"{type}: {asked.reason}; {other}: {second.reason}"
     for each in (result,) if result.asked is None else (result, result.asked):

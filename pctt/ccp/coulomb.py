@@ -69,6 +69,8 @@ def fixed_point(
     status, words = Status.CONVERGED, "Coulomb residual below the tolerance"
     if least > tol:
         status = Status.ITERATION_LIMIT if inner.converged else inner.status
+        if status is Status.UNBOUNDED:  # of a convex problem; the law may have a solution where that has none
+            status = Status.STALLED
         words = f"Coulomb's law not met: residual {least:.1e} at best in {count} cone problems"
         words += "" if inner.converged else f", the last: {inner.reason}"
     found = Result(best.impulse, status, words, least, 0, history=history, cone_problems=count, law=FIXED_POINT)

@@ -157,6 +157,8 @@ class BlockICC(Context):
     def _factorise(self, values: Array) -> str:
         """Make the factor of this rank's rows; why there is none, or nothing."""
         assert self._layout is not None
+        if not np.isfinite(values).all():
+            return "the matrix has entries that are NaN or infinite"
         blocks = values.reshape(-1, 3, 3) if self._source is None else np.append(values, 0.0)[self._source]
         tau, named = self.options.tau, f"-{self.prefix}{self.options_prefix}"
         automatic = self.options.shift == "auto"

@@ -61,6 +61,12 @@ class EntriesTrain:
         self.symmetric = True
         self.failure = self.note = ""
 
+    @property
+    def idle(self) -> dict[str, str]:
+        """Options that have no effect, and why."""
+        none = dict.fromkeys(("eps", "order", "setup_limit"), "there is no train of rank 1") if self.rank == 1 else {}
+        return {"variant": "it is for sparse matrices", **none}
+
     def make(self, A: PETSc.Mat, P: PETSc.Mat) -> bool:
         """Make a preconditioner. False: the diagonal is better, or nothing else worked; `failure` or `note` say why.
 

@@ -81,7 +81,7 @@ class Factor(NamedTuple):
     L: np.ndarray
     unit: float
     pivots: NDArray[np.float32]
-    scale: NDArray[np.float32]
+    scale: NDArray[np.floating]
     work: Array
     shift: float
 
@@ -121,8 +121,10 @@ def factorised(of: Blocks, blocks: Array, tau: float, shift: float) -> Factor | 
     if ended != DONE:
         return ended
     kept = slice(starts[-1])
-    single = scale.astype(np.float32)
-    return Factor(of, starts, below[kept].copy(), L[kept].copy(), unit, pivots, single, np.zeros((n, 4)), shift)
+    single, least = np.finfo(np.float32), scale[:, [0, 2, 5]].min(initial=1.0)
+    if single.tiny < least and np.abs(scale).max(initial=1.0) < single.max:  # else they become zero or infinite
+        scale = scale.astype(np.float32)
+    return Factor(of, starts, below[kept].copy(), L[kept].copy(), unit, pivots, scale, np.zeros((n, 4)), shift)
 
 
 @cache

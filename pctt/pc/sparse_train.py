@@ -56,6 +56,14 @@ class SparseTrain:
         self._pause = self._waits = 0  # set-ups without a trial after the last refusal, and those that are left of them
         self._forget_trains()
 
+    @property
+    def idle(self) -> dict[str, str]:
+        """Options that have no effect, and why."""
+        if self.rank == 1:
+            why = "a sparse matrix has no train unless -pc_tt_rank asks for one"
+            return dict.fromkeys(("eps", "variant", "order", "setup_limit"), why)
+        return {"setup_limit": "it is for matrices given by their entries"}
+
     def _forget_structure(self) -> None:
         self.slots: SlottedMatrix | None = None
         self.hierarchy: SparseHierarchy | None = None

@@ -56,6 +56,7 @@ class TensorTrain(Context):
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
         self.options, self.prefix = Options(), ""
+        self._given: list[str] = []  # the names of options that are given
         self.account = Account()
         self.P: PETSc.Mat | None = None  # the matrix, or a copy of it in AIJ; None if it has no rows
         self.rank = 1
@@ -98,7 +99,8 @@ class TensorTrain(Context):
         """
         self.prefix = pc.getOptionsPrefix() or ""
         prefix = self.prefix + self.options_prefix
-        before, self.options = self.options, read(Options, given_options(Options, prefix), prefix)
+        given = given_options(Options, prefix)
+        before, self.options, self._given = self.options, read(Options, given, prefix), [*given]
         if self.options != before:
             self._structure = None
         if PETSc.Options().hasName("help"):
@@ -183,6 +185,9 @@ class TensorTrain(Context):
             _destroy(operators)
         if not made.symmetric:
             self._warn(self.comm, NOT_SYMMETRIC)
+        for name, why in made.idle.items():
+            if (option := f"{self.prefix}{self.options_prefix}{name}") in self._given:
+                self._warn(self.comm, f"-{option} has no effect: {why}")
         self.failed = bool(made.failure) and self.options.fallback == "none"
         if made.failure and not self._refused:
             takes_over = "there is no preconditioner" if self.failed else f"{made.base} takes over"
@@ -295,7 +300,8 @@ class TensorTrain(Context):
         if self.rank > 1 and reason < 0:
             used = self._used()
             what = f"with {f'rank {used}' if isinstance(used, int) else used}"
-            if reason in SPOILT and self.made.symmetric:  # otherwise it may have been a transpose solve
+            # a matrix that is not symmetric may have had a transpose solve; b with NaN spoils any method
+            if reason in SPOILT and self.made.symmetric and np.isfinite(b.norm()):
                 what = f"{ksp.getType()} broke down ({reason}) {what}"
                 again = self.options.fallback == "jacobi"
                 self.account.fall_back(f"{what}, solved again with block Jacobi" if again else what)
@@ -343,7 +349,7 @@ class TensorTrain(Context):
         again.setOperators(ksp.getOperators()[0], P)
         again.solve(b, x)
         ksp.setIterationNumber(ksp.getIterationNumber() + again.getIterationNumber())
-        ksp.setResidualNorm(again.getResidualNorm())
+        ksp.setResidualNorm(np.nan_to_num(again.getResidualNorm(), nan=np.inf))  # PETSc takes no NaN
         ksp.setConvergedReason(again.getConvergedReason())
         again.destroy()
 

@@ -35,10 +35,12 @@ from pctt.petsc import own_errors
 from pctt.run.output import refusal, refuse_unwritable
 from pctt.run.settings import DEMO, Options, Run, Settings, find_scene
 
-#: Options of simulations, beside those of the scene; those that settled states depend on, and -quiet.
-OF_STEPS = {
-    "scene", "steps", "dt", "delta", "stiffness", "recovery_speed", "restart", "settle", "output_every",
-    "checkpoint_every", "checkpoint_minutes", "dump_problem", "overlap",
+#: Options of steps, of which a settled state has its own; options of simulations, beside those of the scene; those that
+#: settled states depend on, and -quiet.
+OF_MODEL = {"dt", "delta", "stiffness", "recovery_speed"}
+OF_STEPS = OF_MODEL | {
+    "scene", "steps", "restart", "settle", "output_every", "checkpoint_every", "checkpoint_minutes", "dump_problem",
+    "overlap",
 }  # fmt: skip
 OF_SETTLING = {"settle", "scene", "quiet"}
 
@@ -132,7 +134,7 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, asked: Setting
     idle = why_idle(asked.solver, asked.newton, asked.law_for(bool(run.problem or run.compare)))
     rules: list[tuple[Any, set[str], tuple[str, ...], str]] = [  # if, which options by name or by beginning, why not
         (run.problem, OF_STEPS, ("scene_",), f"-problem {run.problem} makes no steps; allowed is one of the two"),
-        (run.settle, own - OF_SETTLING | {"law", *solvers.values()}, ("ccp_",), settles),
+        (run.settle, own - OF_SETTLING | OF_MODEL | {"law", *solvers.values()}, ("ccp_",), settles),
         (not solver.newton, {"compare", "compare_every", "ccp_newton", *solvers.values()}, (), no_newton),
         (idle, {"ccp_newton"}, (), idle),
         (not run.compare, {"compare_every"}, (), "has no effect without -compare; allowed is both"),

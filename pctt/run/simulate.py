@@ -72,6 +72,9 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         progress.say(report.dt_line(settings.dt, sim.dt_reason))
     watch = sim.overlap_watch
     progress.say(report.stiffness_line(sim.world.pairs.stiffness, watch.elastic, watch.steps))
+    if "recovery_speed" in options.given and np.isfinite(sim.world.pairs.stiffness).all():
+        what = f"-recovery_speed {options.given['recovery_speed']}"
+        progress.say(f"options without effect in this run, as no contact is rigid: {what}")
     if settings.tol > report.LOOSE:
         progress.say(f"WARNING: -ccp_tol {settings.tol:g}: {report.LOOSE_BECAUSE}")
     solver = ccp.SOLVERS[settings.solver]
@@ -90,7 +93,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     progress.doing(sim.steps, sim.time, end)
     sim.run(steps=steps, call=say, stop=lambda sim: interrupt.is_requested(sim.comm))
     if sim.steps < end:
-        words = _how_to_go_on(options, output.checkpoint, end - sim.steps)
+        words = _how_to_go_on(options, output.checkpoint, end - sim.steps, settings.dt)
         raise interrupt.InterruptError(f"interrupted after step {sim.steps}; the same command with {words}")
     if sim.last:
         figures = sim.analyse()
@@ -109,9 +112,10 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         progress.say(f"\nresults: {folder}/state.h5, records.csv, steps.jsonl, summary.json, checkpoint.h5")
 
 
-def _how_to_go_on(options: Options, state: Path, steps: int) -> str:
+def _how_to_go_on(options: Options, state: Path, steps: int, dt: float) -> str:
     """What a user who has interrupted a run before its end is told."""
-    words = f"-restart {state} -steps {steps}"
+    rest = f"-steps {steps}" if options.run.seconds is None else f"-seconds {steps * dt:.13g}"  # which has precedence
+    words = f"-restart {state} {rest}"
     if options.demo:
         kept = {name: value for name, value in DEMO.items() if name not in ("restart", "steps", "overwrite")}
         words = " ".join([*(f"-{name} {value}" for name, value in kept.items()), words])

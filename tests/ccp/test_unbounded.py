@@ -167,6 +167,28 @@ def test_coulombs_law_says_so_at_once():
     assert result.cone_problems < 20
 
 
+@pytest.mark.parametrize("solver", [name for name in ccp.SOLVERS if name != "jacobi"])
+def test_where_the_relaxation_has_no_solution_and_coulombs_law_has_one(solver):
+    """A body between two belts that run against each other, with play: sliding contacts of the relaxation open, on both
+    sides by more than the play. By Coulomb's law the lower belt lifts it and rubs, and the upper one is not touched."""
+    G = np.zeros((6, 2))  # velocities up and along of a body of mass 1
+    G[0], G[1], G[3], G[4] = (1, 0), (0, 1), (-1, 0), (0, 1)
+    problem = ccp.ConeProblem(SELF, np.array([[-1.0, 3, 0], [2, -3, 0]]), np.full(2, 0.5), G=G, masses=np.ones(2))
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-6), law=ccp.COULOMB)
+    assert result.converged, result.reason
+    np.testing.assert_allclose(result.impulse, [[1, -0.5, 0], [0, 0, 0]], atol=1e-5)
+    relaxed = ccp.solve(problem, type=solver, limits=Limits(1e-6), law=ccp.RELAXATION)
+    assert relaxed.status is Status.UNBOUNDED
+
+
+@pytest.mark.parametrize("solver", ["kucera", "spectral", "pdip"])
+def test_a_wedge_that_holds_by_friction_has_no_solution_by_either_way_to_coulombs_law(solver):
+    """The sequence of cone problems and the method that is asked after it agree."""
+    result = ccp.solve(squeezed((1.0, 1.0), 0.3, 0.5), type=solver, limits=Limits(1e-6), law=ccp.COULOMB)
+    assert result.status is Status.UNBOUNDED
+    assert result.asked is not None
+
+
 @pytest.mark.parallel(1, 2)
 def test_one_squeezed_sphere_among_many_contacts_on_several_ranks():
     comm = MPI.COMM_WORLD

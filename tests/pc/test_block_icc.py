@@ -177,6 +177,32 @@ def test_a_matrix_that_is_not_positive_definite_ends_the_krylov_method():
     assert solve(ksp)[1] < 1e-12
 
 
+@pytest.mark.parametrize("place", [(4, 4), (4, 5), (4, 9)])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_matrix_that_is_no_number_is_said_to_be_so(value, place):
+    mat = PETSc.Mat().createAIJ((12, 12), nnz=12, comm=PETSc.COMM_SELF)
+    mat.setUp()
+    mat[:, :] = 20.0 * np.eye(12) + 1.0
+    mat[place] = mat[place[::-1]] = value
+    mat.assemble()
+    ksp = solver(mat)
+    with pytest.warns(UserWarning, match="BlockICC: the matrix has entries that are NaN or infinite"):
+        solve(ksp)
+    assert ksp.getConvergedReason() < 0
+
+
+@pytest.mark.parametrize("unit", [1e-120, 1e-90, 1e90, 1e120])
+def test_the_unit_of_a_matrix_changes_nothing_but_the_unit_of_its_inverse(unit):
+    """Numbers of single precision end at 1e38; squares of a matrix of 1e-160 would be zero for PETSc, too."""
+    n = 12
+    mat, scaled = poisson(n), poisson(n)
+    scaled.scale(unit)
+    for one in (mat, scaled):
+        one.setAttr("coordinates", None)
+    M, scaled_M = preconditioner(solver(mat)), preconditioner(solver(scaled))
+    np.testing.assert_allclose(unit * scaled_M, M, rtol=0, atol=1e-6 * np.abs(M).max())
+
+
 def test_a_matrix_that_is_not_symmetric_is_warned_of():
     mat = PETSc.Mat().createAIJ((3, 3), csr=([0, 2, 3, 4], [0, 1, 1, 2], [2.0, 1.0, 2.0, 2.0]), comm=PETSc.COMM_SELF)
     with pytest.warns(UserWarning, match="not symmetric"):

@@ -167,3 +167,71 @@ def test_ranks_without_rows(size):
     b.set(1.0)
     ksp.solve(b, x)
     np.testing.assert_allclose(x.array, 1.0 if size > 2 else 0.5)
+
+
+def test_a_right_side_that_is_no_number_is_not_the_fault_of_the_train():
+    """The method ends with PETSc's reason, and the train stays for other right sides."""
+    ksp = solver(stored(ring(40, 1)), **SMALL)
+    x, b = ksp.getOperators()[0].createVecs()
+    b.set(1.0)
+    b[3] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ksp.solve(b, x)
+    assert ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_NANORINF
+    assert left(ksp) < 1e-8
+    assert ksp.pc.getPythonContext().rank == 20
+
+
+@pytest.mark.parametrize("fallback", ["jacobi", "none"])
+def test_products_that_are_no_numbers_end_with_the_reason_of_petsc(fallback):
+    """The train is that of another matrix, which has numbers."""
+
+    class NoNumbers:
+        def mult(self, mat, x, y):
+            y.set(np.nan)
+
+    P = stored(ring(40, 1))
+    A = PETSc.Mat().createPython((40, 40), NoNumbers(), comm=PETSc.COMM_SELF)
+    A.setUp()
+    ksp = solver(P, fallback=fallback, **SMALL)
+    ksp.setOperators(A, P)
+    x, b = P.createVecs()
+    b.set(1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ksp.solve(b, x)
+    assert ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_NANORINF
+
+
+@pytest.mark.parametrize(
+    ("options", "idle"),
+    [
+        ({"eps": 1e-3}, ["eps"]),
+        ({"variant": "paper", "order": "natural", "rank": 1}, ["variant", "order"]),
+        ({"setup_limit": 1e9, "rank": 12}, ["setup_limit"]),
+        ({"reuse": "trains", "fallback": "none"}, []),
+    ],
+)
+def test_options_without_an_effect_are_named(options, idle):
+    ksp = solver(poisson(8), prefix="a_", **options)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            left(ksp)
+            ksp.getOperators()[0].scale(2.0)
+    words = [str(one.message) for one in heard if "no effect" in str(one.message)]
+    assert [line.split(" has no effect")[0].split()[-1] for line in words] == [f"-a_pc_tt_{name}" for name in idle]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"variant": "paper", "rank": 20}, "-pc_tt_variant has no effect: it is for sparse matrices"),
+        ({"eps": 1e-3, "rank": 1}, "-pc_tt_eps has no effect: there is no train of rank 1"),
+    ],
+)
+def test_options_without_an_effect_on_entries_are_named(options, words):
+    ksp = solver(stored(ring(20, 1), "dense"), **options)
+    with pytest.warns(UserWarning, match=words):
+        ksp.setUp()

@@ -73,6 +73,10 @@ BAD_OPTIONS = {
     "-ksp_rtol 1e-3 -ccp_type apgd": ["apgd solves no Newton systems", "pdip"],
     "-law columb": ["columb", "did you mean coulomb?"],
     "-law coulomb -settle": ["-settle makes its state with APGD"],
+    "-dt 0.01 -settle": ["-dt 0.01: -settle makes its state with APGD"],
+    "-delta 0.01 -settle": ["-delta 0.01: -settle makes its state with APGD"],
+    "-stiffness 1e5 -settle": ["-stiffness 1e5: -settle makes its state with APGD"],
+    "-recovery_speed 2 -settle": ["-recovery_speed 2: -settle makes its state with APGD"],
     "-scene_torque 0": ["0", "must be positive"],
     "-scene_drawbar 3 -scene wheel": ["3 wheel weights has no effect on a carriage that is driven; allowed with the"],
     "-scene_slip 0.2 -scene wheel -scene_free": ["0.2 has no effect on a carriage that moves freely; allowed without"],
@@ -303,3 +307,10 @@ def test_an_output_folder_under_a_regular_file_is_refused(program, results, tmp_
 def test_a_scene_that_flies_apart_ends_with_one_line(program):
     done = program(*SMALL, "-scene_gravity", 1e308, "-dt", 1e3, "-steps", 3, status=1)
     assert "step" in one_line(done, 1)
+
+
+def test_a_run_without_rigid_contacts_says_that_nothing_pushes_them_apart(program, settled):
+    words = (*SMALL, "-steps", 0, "-recovery_speed", 0.5, "-overwrite", "-restart", settled)
+    idle = "options without effect in this run, as no contact is rigid: -recovery_speed 0.5\n"
+    assert idle in program(*words).stdout
+    assert "without effect" not in program(*words, "-stiffness", "inf").stdout

@@ -16,6 +16,7 @@ from program import EVERY, SMALL, assert_same_bits, command, environment
 from test_killed import python_of
 
 from pctt.run import interrupt
+from pctt.run.settings import Run
 
 OPTIONS = (*SMALL, *EVERY, "-ccp_type", "apgd", "-ccp_tol", 1e-3)
 RANKS = [1, pytest.param(2, marks=pytest.mark.mpi)]
@@ -55,26 +56,28 @@ def _listen_to_ctrl_c():
 @pytest.mark.parametrize("ranks", RANKS)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
 def test_an_interrupted_run_goes_on(number, ranks, program, tmp_path, cache):
-    steps = 400
+    steps, dt = 400, 0.0125
+    timed = number == signal.SIGTERM
+    length = ("-dt", dt, "-seconds", steps * dt) if timed else ("-steps", steps)
     late = ("-checkpoint_every", steps)  # so that no checkpoint is there but the one that an interrupted run writes
     out = tmp_path / "out"
     rows = out / "steps.jsonl"
     status, said = interrupted(
-        (*OPTIONS, *late, "-steps", steps, "-output", "out"), ranks, tmp_path, cache, rows.exists, number
+        (*OPTIONS, *late, *length, "-output", "out"), ranks, tmp_path, cache, rows.exists, number
     )
     assert status == 130, said
     lines = [line for line in said.splitlines() if line.startswith("pctt.run: interrupted")]
     assert len(lines) == 1, said
     found = re.fullmatch(
-        r"pctt.run: interrupted after step (\d+); the same command with -restart out/checkpoint.h5 -steps (\d+) "
-        "at its end goes on",
+        r"pctt.run: interrupted after step (\d+); the same command with -restart out/checkpoint.h5 "
+        rf"-{'seconds' if timed else 'steps'} (\S+) at its end goes on",
         lines[0],
     )
-    done, left = map(int, found.groups())
+    done, left = int(found[1]), Run(seconds=float(found[2])).steps_of(dt) if timed else int(found[2])
     assert done + left == steps
     assert left > 0
     assert len(rows.read_text().splitlines()) == done
-    if number == signal.SIGTERM:  # which ends a run as SIGINT does
+    if timed:  # SIGTERM ends a run as SIGINT does
         return
     more = min(left, 3)
     program(*OPTIONS, "-output", "out", "-restart", "out/checkpoint.h5", "-steps", more, ranks=ranks)
