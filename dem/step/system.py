@@ -141,9 +141,10 @@ class ContactSystem:
         self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
         if self.resistance is not None and self.attraction is not None:
             self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
-        self.at_once, self._freely = 0, freely
+        self.at_once = 0
         self._bounces = np.zeros(len(contacts), np.bool_)
         if world.pairs.bounces:
+            self._freely = freely
             self._bounce(world, contacts, freely[:, 0], eased)
         impacts = self._bounces
         if contacts.parting is not None:
@@ -361,7 +362,7 @@ def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> 
     moved = np.zeros((0, 3)) if contacts.moved is None else contacts.moved
     # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
     row, body, touched, arm = _rows_of(
-        contacts.a, contacts.b, contacts.body, table.mass, owned, contacts.point, moved, table.position
+        contacts.a, contacts.b, near.index, table.mass, owned, contacts.point, moved, table.position
     )
     rows = CompactRows(frame.reshape(-1, 9), arm, body, inverse_root_masses(world, drives), owned)
     ghosts = touched.nonzero()[0]
@@ -497,9 +498,9 @@ def _beyond(b, freely, rounding, frame, swing, impacts, compliance, held):
 
 
 @loop
-def _rows_of(a, b, body, mass, owned, point, moved, position):
-    """Of contacts of bodies in the rows a and b (nc,): the rows (nc, 2), the indices `body` (nc, 2) of those that move,
-    else -1, which rows that this rank does not own they touch and move, and the arms of `contact_arms`."""
+def _rows_of(a, b, index, mass, owned, point, moved, position):
+    """Of contacts of bodies in the rows a and b (nc,): the rows (nc, 2), the `index` (nc, 2) of those that move, else
+    -1, which rows that this rank does not own they touch and move, and the arms of `contact_arms`."""
     row, moving = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64)
     touched, arm = np.zeros(len(mass), np.bool_), np.empty((len(a), 6))
     for c in range(len(a)):
@@ -507,7 +508,7 @@ def _rows_of(a, b, body, mass, owned, point, moved, position):
         for k in range(2):
             n = row[c, k]
             moves = np.isfinite(mass[n])
-            moving[c, k] = body[c, k] if moves else -1
+            moving[c, k] = index[n] if moves else -1
             if n >= owned and moves:
                 touched[n] = True
         _set_arm(c, point, moved, position, row, arm)

@@ -65,26 +65,30 @@ class ScaledProblem:
         self.problem, self.coulomb, self.precision = problem, coulomb, precision
         shape = problem.r.shape
         self.unit = 2.0 ** math.frexp(problem.max(_largest(problem.r)))[1]
-        self.shrink, self._units = np.empty(shape), np.empty((2, *shape))  # the diagonal of S^-1; of x, of a gradient
-        self._impulse, self._velocity = self._units
+        self.size = np.empty(shape)  # the diagonal of S
         self.b, self._compliance = np.empty((2, *shape), precision)
         given = problem.diagonal, problem.mean_diagonal, self.unit, problem.r, problem.compliance
-        _scale(*given, (self.shrink, self._impulse, self._velocity), self.b, self._compliance)
-        self.cones = problem.cones.scaled(self._velocity, precision)
+        _scale(*given, self.size, self.b, self._compliance)
+        self.cones = problem.cones.scaled(self.size, precision)
         self._operator = problem.operator.scaled(self.shrink, precision)
         soft = self._compliance[: None if problem.yields else 0]
         self._all = self._active = ActiveSet(None, self._operator, self.cones, self.b, soft)
+
+    @property
+    def shrink(self) -> Array:
+        """The diagonal of S^-1 (nc, 3)."""
+        return 1.0 / self.size
 
     def _rounded(self, x: Array) -> Array:
         return x.astype(self.precision, copy=False)
 
     def start(self, guess: Array) -> Array:
         """The scaled point of a first guess of the impulses (nc, 3), in the cones."""
-        return self.project(self._rounded(guess / self._impulse))
+        return self.project(self._rounded(guess / (self.unit / self.size)))
 
     def impulse(self, x: Array) -> Array:
         """The impulses (nc, 3) of x, in the cones in double precision too."""
-        g = x * self._impulse
+        g = x * (self.unit / self.size)
         return g if self.precision is np.float64 else self.problem.cones.project(g, g)
 
     def product(self, x: Array) -> Array:
@@ -181,13 +185,14 @@ class ScaledProblem:
 
     def block_steps(self) -> Array:
         """1 over the largest eigenvalue of each contact's diagonal block of A, per unknown (nc, 3)."""
-        blocks = self.problem.diagonal_blocks * (self.shrink[:, :, None] * self.shrink[:, None, :])
+        shrink = self.shrink
+        blocks = self.problem.diagonal_blocks * (shrink[:, :, None] * shrink[:, None, :])
         largest = np.linalg.eigvalsh(blocks)[:, -1]
         return np.repeat(1.0 / np.where(largest > 0, largest, 1.0), 3).reshape(-1, 3)
 
     def errors(self, x: Array, gradient: Array) -> Errors:
         """Of the impulses of x, but for rounding in the cones, and the velocities N g + r of its gradient A x + b."""
-        return self.problem.errors(x, gradient, self.coulomb, self._units)
+        return self.problem.errors(x, gradient, self.coulomb, (self.unit, self.size))
 
     def largest_curvature(self, steps: int = 10) -> float:
         """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""
@@ -214,18 +219,16 @@ def _largest(r):
 
 
 @loop
-def _scale(diagonal, mean, unit, r, compliance, units, b, soft):
-    """Fill in five arrays (nc, 3) of a `ScaledProblem`, for the diagonal of N, its mean, and the unit."""
-    shrink, impulse, velocity = units
+def _scale(diagonal, mean, unit, r, compliance, sizes, b, soft):
+    """Fill in three arrays (nc, 3) of a `ScaledProblem`, for the diagonal of N, its mean, and the unit."""
     for c in range(len(r)):
         normal, tangential = diagonal[c, 0], 0.5 * (diagonal[c, 1] + diagonal[c, 2])
         normal = np.sqrt(normal if normal > 0.0 else mean)
         tangential = np.sqrt(tangential if tangential > 0.0 else mean)
         for k in range(3):
             size = tangential if k else normal
-            shrink[c, k] = 1.0 / size
-            impulse[c, k], velocity[c, k] = unit / size, unit * size
-            b[c, k], soft[c, k] = r[c, k] / velocity[c, k], compliance[c, k] * (shrink[c, k] * shrink[c, k])
+            sizes[c, k], shrink = size, 1.0 / size
+            b[c, k], soft[c, k] = r[c, k] / (unit * size), compliance[c, k] * (shrink * shrink)
 
 
 @loop
