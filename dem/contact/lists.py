@@ -12,7 +12,6 @@ from operator import attrgetter, is_
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 from dem import bodies

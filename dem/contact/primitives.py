@@ -139,9 +139,9 @@ class Primitives(NamedTuple):
 def primitives(
     near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int, forms: tuple[Form, ...] = (), initial: int = 0
 ) -> Primitives:
-    """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies, for `Primitives.now`; it has
-    the places and sizes of the parts alone, in the frames of their bodies. `grains` is the number of grains on all ranks, of which those with ids
-    below `initial` may have `forms`. ValueError if there are more than have names."""
+    """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies, for `Primitives.now`; it
+    has the places and sizes of the parts alone, in the frames of their bodies. `grains` is the number of grains on all
+    ranks, of which those with ids below `initial` may have `forms`. ValueError if there are more than have names."""
     table, count, hulls = near.bodies, near.grains + near.ghosts, hulls_of(forms)
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
     parts_of = [shape for body in shapes for shape in body]

@@ -28,13 +28,15 @@ Rows = NDArray[np.intp]
 
 
 class Iterate(NamedTuple):
-    """A point x (nc, 3), and its image: what it does to the bodies (`ContactMap.image`)."""
+    """A point x, and its image: what it does to the bodies (`ContactMap.image`)."""
 
-    x: Array
+    x: Array  #: (n, 3) of the active set
     image: Array
+    room: Array  #: (nc, 3) the memory of x, for all contacts
 
     def copy(self) -> Iterate:
-        return Iterate(self.x.copy(), self.image.copy())
+        x = self.x.copy()
+        return Iterate(x, self.image.copy(), x)
 
 
 class ActiveSet(NamedTuple):
@@ -110,8 +112,8 @@ class ScaledProblem:
 
     def iterate(self, x: Array) -> Iterate:
         """The iterate at x (nc, 3), which is kept."""
-        found = Iterate(x, self._operator.image())
-        self._operator.find_image(*found)
+        found = Iterate(x, self._operator.image(), x)
+        self._operator.find_image(x, found.image)
         return found
 
     def rigid_gradient(self, now: Iterate, last: Iterate, beta: float, out: Array) -> Array:
@@ -124,18 +126,13 @@ class ScaledProblem:
         self.rigid_gradient(now, now, 0.0, y)
         return y + self._compliance * now.x if self.problem.yields else y
 
-    def restore(self, now: Iterate, last: Iterate, new: Iterate) -> tuple[Iterate, Iterate, Iterate, Array]:
-        """The iterates with all contacts, memory for a new one, and memory (nc, 3) for a gradient."""
+    def restore(self, now: Iterate, last: Iterate, new: Iterate) -> list[Iterate]:
+        """The iterates with all contacts, of which the last is memory for a new one."""
         rows, self._active = self._active.rows, self._all
         if rows is not None:
-            now, last = self._scattered(now, rows), self._scattered(last, rows)
-        x, y = np.empty((2, *self.b.shape), self.b.dtype)
-        return now, last, Iterate(x, new.image), y
-
-    def _scattered(self, iterate: Iterate, rows: Rows) -> Iterate:
-        x = np.zeros_like(self.b)
-        _put(rows, iterate.x, x)
-        return Iterate(x, iterate.image)
+            for iterate in (now, last):
+                _spread(rows, iterate.room)
+        return [Iterate(room, image, room) for _, image, room in (now, last, new)]
 
     def restrict(
         self, now: Iterate, last: Iterate, new: Iterate, y: Array, length: float
@@ -143,7 +140,7 @@ class ScaledProblem:
         """Leave out contacts that will stay open until the next look, as far as one can see: they have no impulse, and
         open five times faster than steps change velocities, which is the root mean square of their ``length`` |L step|.
         A contact too many costs iterations, but no accuracy. ``y`` (nc, 3) is the rigid gradient of all contacts.
-        Returns what `restore` does, of the active set, with this gradient: fewer, side by side, move fewer bytes."""
+        Returns what `restore` does and this gradient, of the active set: fewer, side by side, move fewer bytes."""
         every = self._all
         if not every.operator.has_parts:
             return now, last, new, y
@@ -156,18 +153,21 @@ class ScaledProblem:
         def active(array: Array) -> Array:
             return np.take(array, rows, axis=0) if len(array) else array
 
-        now, last, y = Iterate(active(now.x), now.image), Iterate(active(last.x), last.image), active(y)
+        for room in (now.room, last.room, y):
+            _gather(rows, room)
         assert isinstance(every.operator, ContactMap)
         operator, cones = every.operator.only(contacts), self.cones.only(contacts)
         self._active = ActiveSet(rows, operator, cones, active(every.b), active(every.compliance))
-        return now, last, Iterate(np.empty(y.shape, y.dtype), new.image), y
+        here = slice(len(rows))
+        now, last, new = (Iterate(room[here], image, room) for _, image, room in (now, last, new))
+        return now, last, new, y[here]
 
     def step(self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate) -> Sequence[float]:
         """The projected step of this length from z, where the rigid gradient is y, into ``new``; of the step d from z
         d'Ad and |d|^2, and y_z'(x_new - x), with y_z the gradient at z with the De Saxce term of Coulomb's law."""
         _, operator, cones, _, soft = self._active
         work, square, uphill = cones.accelerated_step(now.x, last.x, y, soft, beta, length, self.coulomb, new.x)
-        operator.find_image(*new)
+        operator.find_image(new.x, new.image)
         work += operator.energy_of_step(new.image, now.image, last.image, beta)
         return self.problem.sums(work, square, uphill)
 
@@ -232,11 +232,22 @@ def _scale(diagonal, mean, unit, r, compliance, sizes, b, soft):
 
 
 @loop
-def _put(rows, x, out):
-    """out[rows] = x (n, 3)."""
+def _gather(rows, x):
+    """Move the rows (n,) of x (nc, 3), which ascend, to its first rows."""
     for k in range(len(rows)):
         c = rows[k]
-        out[c, 0], out[c, 1], out[c, 2] = x[k, 0], x[k, 1], x[k, 2]
+        x[k, 0], x[k, 1], x[k, 2] = x[c, 0], x[c, 1], x[c, 2]
+
+
+@loop
+def _spread(rows, x):
+    """Move the first rows of x (nc, 3) to the rows (n,), which ascend; the others become zero."""
+    k = len(rows) - 1
+    for c in range(len(x) - 1, -1, -1):
+        here = k >= 0 and rows[k] == c
+        for i in range(3):
+            x[c, i] = x[k, i] if here else 0.0
+        k -= here
 
 
 @dataclass(frozen=True)
@@ -332,7 +343,8 @@ class Progress:
             if self.limits.tol < residual < np.inf:
                 return residual
         g, problem = self.problem.impulse(x), self.problem.problem
-        y = problem.product(g) + problem.r  # in double precision
+        y = problem.product(g)  # in double precision
+        y += problem.r
         if not math.isfinite(problem.dot(g, y)):
             return math.nan
         return self._judge(problem.errors(g, y, self.problem.coulomb), x)
