@@ -197,10 +197,8 @@ class ConeProblem:
 
     def product(self, g: Array) -> Array:
         """N g for impulses g (nc, 3): velocities of the contacts (nc, 3)."""
-        y = np.zeros(self.r.shape)
+        y = self.compliance * g if self.yields else np.zeros(self.r.shape)
         self.operator.add_delassus(g, y)
-        if self.yields:
-            y += self.compliance * g
         return y
 
     def momentum(self, g: Array) -> Array:

@@ -112,7 +112,7 @@ class Stepper:
             rebalance(world)
             free = unconstrained(world, given.dt)  # gravity, spin, loads, springs, drives, motions
             contacts = in_order(world, find_contacts(world, given.delta, free), free)
-            self.world.lists = contacts.lists  # a search finds the same with any that hold: the old ones take memory
+            self.world.lists = world.lists = contacts.lists  # they hold for what old ones held, which take memory
         while True:
             with log.phase("assembly"):
                 last, kept = self._recalled(world, contacts)

@@ -90,7 +90,8 @@ class ScaledProblem:
 
     def impulse(self, x: Array) -> Array:
         """The impulses (nc, 3) of x, in the cones in double precision too."""
-        g = x * (self.unit / self.size)
+        g = self.unit / self.size
+        g *= x
         return g if self.precision is np.float64 else self.problem.cones.project(g, g)
 
     def product(self, x: Array) -> Array:
