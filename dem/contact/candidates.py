@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dem import bodies
 from dem.arrays import Bools, Floats, Ints
@@ -19,7 +20,7 @@ from dem.quaternion import cross, length
 Pairs = tuple[Ints, Ints, Floats]
 
 #: The `Rows` of grains: start and other; their margins (grains + ghosts,) [m], and which of them have pairs that count.
-Grains = tuple[Ints, Ints, Floats, Bools]
+Grains = tuple[Ints, NDArray[np.int32], Floats, Bools]
 
 #: Of parts of large bodies the rows (p,) of `Primitives`, the bodies (p,) and the frames (p, 9).
 Parts = tuple[Ints, Ints, Floats]
@@ -64,7 +65,7 @@ def _of_images(near: Neighbourhood, wanted: Bools, table: Primitives, delta: flo
     names = ("number", "kind", "center", "quaternion", "size", "radius")
     columns = {name: getattr(table, name)[rows] for name in names}
     row = np.concatenate([np.arange(count), table.row[first:] - first + count])
-    none = Rows(np.zeros(count + 1, np.int64), np.zeros(0, np.int64))
+    none = Rows(np.zeros(count + 1, np.int64), np.zeros(0, np.int32))
     solid = table.kind[first:] != PLANE
     given = none, solid, table._replace(row=row, **columns), delta, shifts, np.ones(count, bool)
     found = _of_grains(image_bodies, *given)

@@ -7,11 +7,12 @@ whether the margins meet now: it finds the same with the lists of an earlier ste
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter, is_
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dem import bodies
 from dem.arrays import Floats, Ints
@@ -40,14 +41,14 @@ class Rows:
     """For each local grain the other grains of its pairs, which follow it in the table of bodies."""
 
     start: Ints  #: (grains + 1,)
-    other: Ints  #: (start[-1],) rows, in the order of the contacts
+    other: NDArray[np.int32]  #: (start[-1],) rows, in the order of the contacts
 
 
 @dataclass(frozen=True)
 class Lists:
     """The lists of this rank, and what they were made for."""
 
-    near: Neighbourhood  #: then; its margins have the slack
+    near: Neighbourhood  #: then, without what no list needs, `refreshed` has it; its margins have the slack
     halo: Halo  #: between the grains of `near`
     table: Primitives  #: of the bodies of `near`, not yet where they are
     own: Rows  #: pairs of local grains
@@ -81,12 +82,14 @@ def _new_lists(world: World, margin: Floats, travel: Floats) -> Lists:
     seen = wide.grains + wide.ghosts
     large = [body.shapes for body in world.large_bodies]
     table = primitives(wide, large, world.first_large, world.forms, world.initial)
-    pairs = pictures.once(close_pairs(table.center[:seen], table.radius[:seen] + wide.margin), wide.index)
+    pairs = pictures.once(close_pairs(wide.bodies.position[:seen], table.radius[:seen] + wide.margin), wide.index)
     index = near.index[grains:count]
     owner = np.searchsorted(world.slabs, index, side="right") - 1
     halo = Halo(world.comm, grains, len(near.bodies), np.arange(grains, count), owner, index - world.slabs[owner])
     own, away = (Rows(*in_rows(pairs, table.number, grains, *ends)) for ends in ((0, grains), (grains, seen)))
-    return Lists(near, halo, table, own, away, pictures, world.cell, _constant(world))
+    none = bodies.none()
+    places = replace(near, bodies=replace(near.bodies, quaternion=none.quaternion, velocity=none.velocity))
+    return Lists(places, halo, table, own, away, pictures, world.cell, _constant(world))
 
 
 def _constant(world: World) -> list[Any]:
@@ -116,7 +119,7 @@ def stays(then: Floats, most: Floats, size: Floats, now: Floats, wanted: Floats,
 
 
 @loop
-def in_rows(pairs: Ints, id: Ints, rows: int, low: int, high: int) -> tuple[Ints, Ints]:
+def in_rows(pairs: Ints, id: Ints, rows: int, low: int, high: int) -> tuple[Ints, NDArray[np.int32]]:
     """The pairs (m, 2) of a row below `rows` and of one from `low` to `high` as `Rows`: in the order of the first row,
     then of the lower id of the two, then of the higher."""
     start = np.zeros(rows + 1, np.int64)
@@ -125,7 +128,7 @@ def in_rows(pairs: Ints, id: Ints, rows: int, low: int, high: int) -> tuple[Ints
             start[pairs[k, 0] + 1] += 1
     for n in range(rows):
         start[n + 1] += start[n]
-    other, end = np.empty(start[rows], np.int64), start[:rows].copy()
+    other, end = np.empty(start[rows], np.int32), start[:rows].copy()
     for k in range(len(pairs)):
         i, j = pairs[k, 0], pairs[k, 1]
         if i < rows and low <= j < high:

@@ -139,9 +139,9 @@ class Primitives(NamedTuple):
 def primitives(
     near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int, forms: tuple[Form, ...] = (), initial: int = 0
 ) -> Primitives:
-    """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies, for `Primitives.now`; the
-    parts are in the frames of their bodies. `grains` is the number of grains on all ranks, of which those with ids
-    below `initial` may have `forms`. ValueError if there are more than have names."""
+    """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies, for `Primitives.now`; it
+    has the places and sizes of the parts alone, in the frames of their bodies. `grains` is the number of grains on all
+    ranks, of which those with ids below `initial` may have `forms`. ValueError if there are more than have names."""
     table, count, hulls = near.bodies, near.grains + near.ghosts, hulls_of(forms)
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
     parts_of = [shape for body in shapes for shape in body]
@@ -153,9 +153,6 @@ def primitives(
         "number": (table.id, grains + np.cumsum([0, *spans])[:-1]),
         "row": (np.arange(count), row),
         "kind": (table.shape, np.array(kinds, np.int64) + np.array(numbers, np.int64)),
-        "center": (table.position, center),
-        "quaternion": (table.quaternion, turn),
-        "size": (table.size, size),
     }
     after = grains + sum(spans)
     last = after + more_numbers(forms, initial)
@@ -167,7 +164,10 @@ def primitives(
     both = {name: np.concatenate([of_grains[:count], of_parts]) for name, (of_grains, of_parts) in columns.items()}
     return Primitives(
         **both,
-        radius=enclosing_radius(both["kind"], both["size"]),
+        center=center,
+        quaternion=turn,
+        size=size,
+        radius=enclosing_radius(both["kind"], np.concatenate([table.size[:count], size])),
         surfaces={count + n: shape.surface for n, shape in enumerate(parts_of) if isinstance(shape, Mesh)},
         hulls=hulls,
         supports=supports_of(forms),
@@ -292,16 +292,16 @@ def with_parts(first, row, kind, bodies, parts):
     `bodies` in the same rows; each of the `parts`, which are in the frames of the bodies in their `row` (n,), goes with
     its body, and the normals of half spaces turn."""
     (position, turns, sizes), (offset, own, extent) = bodies, parts
-    center, turn, size = np.empty(offset.shape), np.empty(own.shape), np.empty(extent.shape)
+    center, turn, size = np.empty((len(row), 3)), np.empty((len(row), 4)), np.empty((len(row), 3))
     center[:first], turn[:first], size[:first] = position[:first], turns[:first], sizes[:first]
     for n in range(first, len(row)):
-        p, q = turns[row[n]], own[n]
+        p, q, part = turns[row[n]], own[n - first], n - first
         axis, twice = vector_of(p, 1), 2.0 * p[0]
-        moved = turned(vector_of(offset[n], 0), axis, twice, 2.0)
-        sized = turned(vector_of(extent[n], 0), axis, twice, 2.0)
+        moved = turned(vector_of(offset[part], 0), axis, twice, 2.0)
+        sized = turned(vector_of(extent[part], 0), axis, twice, 2.0)
         for k in range(3):
             center[n, k] = position[row[n], k] + moved[k]
-            size[n, k] = sized[k] if kind[n] == PLANE else extent[n, k]
+            size[n, k] = sized[k] if kind[n] == PLANE else extent[part, k]
         turn[n, 0] = p[0] * q[0] - (p[1] * q[1] + p[2] * q[2] + p[3] * q[3])
         turn[n, 1] = p[0] * q[1] + q[0] * p[1] + (p[2] * q[3] - p[3] * q[2])
         turn[n, 2] = p[0] * q[2] + q[0] * p[2] + (p[3] * q[1] - p[1] * q[3])

@@ -41,7 +41,6 @@ class Contacts:
     key: Keys  #: (nc,) the same for the same two shapes and feature at all times and on any number of ranks
     a: Ints  #: (nc,) row of the first body in `near.bodies`, the one of lower id
     b: Ints  #: (nc,) row of the second body in `near.bodies`
-    body: Ints  #: (nc, 2) global indices of the two bodies
     point: Floats  #: (nc, 3) middle between the surfaces, as seen from body a [m]
     normal: Floats  #: (nc, 3) unit vector from a to b, as foreseen for the end of the step by `dem.contact.ahead`
     #: (nc,) signed distance at the start of the step, negative if the bodies overlap; of capsules, polyhedra and meshes
@@ -70,6 +69,11 @@ class Contacts:
 
     def __len__(self) -> int:
         return len(self.key)
+
+    @property
+    def body(self) -> Ints:
+        """Global indices (nc, 2) of the two bodies."""
+        return self.near.index[np.stack([self.a, self.b], axis=1)]
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row per contact by name, without copies."""
@@ -153,11 +157,11 @@ def find_contacts(
     pairs = _that_touch(world, near, table, meeting(world, near, lists, table, delta, shifts, grown))
     table, i, j, reach = table.of_members(*pairs)
     found, ahead = _narrow(world, near, images, table, (i, j, reach), free)
-    key, a, b, body, friction, owned = named(
-        *((table.kind, table.row), table.number, near.index, near.bodies.material, world.pairs.friction),
+    key, a, b, friction, owned = named(
+        *((table.kind, table.row), table.number, near.bodies.material, world.pairs.friction),
         *(table.hulls.features, near.grains, (i, j), (found.pair, found.feature)),
     )
-    contacts = Contacts(key, a, b, body, *found.touch, friction, near, shifts, owned, lists, **ahead)
+    contacts = Contacts(key, a, b, *found.touch, friction, near, shifts, owned, lists, **ahead)
     if world.cell.periodic:
         contacts = _without_images(world, contacts, base, images)
     _put_in_order(world, contacts, found.pair, table.members is not None or world.cell.periodic)
@@ -263,15 +267,15 @@ def _grown(near: Neighbourhood, shifts: Floats, besides: Contacts | None) -> Boo
 
 
 @loop
-def named(shapes, number, index, material, friction, features, grains, pairs, contacts):
+def named(shapes, number, material, friction, features, grains, pairs, contacts):
     """Of contacts, with the numbers (nc,) of their `pairs`, rows i, j (m,) of the shapes, and their features (nc,):
-    key, rows a and b of the bodies, `index` of the bodies (nc, 2), friction; and how many each of the `grains` owns.
+    key, rows a and b of the bodies, friction; and how many each of the `grains` owns.
 
     Keys are distinct, and the same at all times: the number of the one, and that of the other with the feature. A mesh
     takes further numbers for its features."""
     (kind, row), (i, j), (pair, feature) = shapes, pairs, contacts
     key, a, b = np.empty(len(pair), np.complex128), np.empty(len(pair), np.int64), np.empty(len(pair), np.int64)
-    body, mu, owned = np.empty((len(pair), 2), np.int64), np.empty(len(pair)), np.zeros(grains)
+    mu, owned = np.empty(len(pair)), np.zeros(grains)
     for c in range(len(pair)):
         p, q = i[pair[c]], j[pair[c]]
         one, two, own = number[p], number[q], feature[c]
@@ -283,12 +287,11 @@ def named(shapes, number, index, material, friction, features, grains, pairs, co
                 two += further
         key[c] = complex(one, two * features + own)
         a[c], b[c] = row[p], row[q]
-        body[c, 0], body[c, 1] = index[a[c]], index[b[c]]
         mu[c] = friction[material[a[c]], material[b[c]]]
         owner = min(a[c], b[c])  # the local grains are the first rows, and ghosts come from higher ranks only
         if owner < grains:
             owned[owner] += 1.0
-    return key, a, b, body, mu, owned
+    return key, a, b, mu, owned
 
 
 def contact_order(world: World, near: Neighbourhood, a: Ints, b: Ints, key: Keys) -> Ints:

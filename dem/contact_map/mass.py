@@ -44,9 +44,10 @@ class InverseMass:
         if precision is self.precision:
             return self
         other = copy.copy(self)
-        tables = (np.ascontiguousarray(x, dtype=precision) for x in (self.root, self.square, self.unshared))
-        other.precision, (other.root, other.square, other.unshared) = precision, tables
-        other.none = np.zeros(0, precision)
+        other.root, other.square = (np.ascontiguousarray(x, dtype=precision) for x in (self.root, self.square))
+        alone = self.unshared is self.square
+        other.unshared = other.square if alone else np.ascontiguousarray(self.unshared, dtype=precision)
+        other.precision, other.none = precision, np.zeros(0, precision)
         return other
 
     def scale(self, v: Floats, out: Floats) -> None:

@@ -6,8 +6,9 @@ them apart, `find_overrun` and `find_turned` find the others.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -185,10 +186,10 @@ def _move(table: Bodies, velocity: Floats, dt: float) -> None:
 def find_overrun(
     world: World, free: UnconstrainedMotion, contacts: Contacts, velocity: Floats, delta: float, depth: float,
     recovery_speed: float,
-) -> Contacts | None:  # fmt: skip
-    """Return the contacts of wider margins, if with these velocities (owned, 6) bodies go further in the step than
-    their margins in the search for `contacts`, and overlap by more than `depth` [m] with others that it has not seen.
-    None if none do; collective.
+) -> Callable[[], Contacts] | None:  # fmt: skip
+    """Return the search for the contacts of wider margins, if with these velocities (owned, 6) bodies go further in the
+    step than their margins in the search for `contacts`, and overlap by more than `depth` [m] with others that it has
+    not seen. None if none do; collective, as the search is, before which these contacts may go.
 
     The search may be repeated for the contacts that it finds: margins only grow.
     """
@@ -208,7 +209,7 @@ def find_overrun(
     overlap = -dt * (gap_velocities(world, unseen, dt, recovery_speed)[2] + opening)
     if not on_any(world.comm, bool((overlap > depth).any()))[0]:
         return None
-    return find_contacts(world, delta, free, margin, shifts, unseen.lists)
+    return partial(find_contacts, world, delta, free, margin, shifts, unseen.lists)
 
 
 def _opening(world: World, contacts: Contacts, position: Floats, velocity: Floats) -> Floats:

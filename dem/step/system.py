@@ -68,8 +68,8 @@ class ContactSystem:
         drift (nc, 3): what the cell adds to relative velocities, in the frames, or None; until `take_flow` that of the
         last step, in a cell that deforms [m/s]
         surface (nc, 2): tangential velocities of surfaces [m/s], see `dem.step.surface`; None if there is none
-        b (nc, 3): (gap / dt, surface) [m/s], see `gap_velocities`
-        r (nc, 3): b + D' v_free [m/s]; zero where it is rounding, see `dem.contact_map.loops.closing`
+        r (nc, 3): b + D' v_free, b = (gap / dt, surface), see `gap_velocities` [m/s]; zero where it is rounding, see
+        `dem.contact_map.loops.closing`
         near: the bodies about this rank
         contact_map: G, with the halo of the bodies; the rows of its tables are those of `near`
         problem_map: G of the cone problem: with the rows of turning, where contacts resist it
@@ -119,11 +119,11 @@ class ContactSystem:
         free, freely, rounding = self._free(world, change)
         self.free_velocity = free[:owned]
         self.free_large = free[near.grains + near.ghosts :]
-        self.b = np.zeros((len(contacts), 3))
-        self.stiffness, self.compliance, self.b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
+        b = np.zeros((len(contacts), 3))
+        self.stiffness, self.compliance, b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
         self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
         if self.surface is not None:
-            self.b[:, 1:] = self.surface
+            b[:, 1:] = self.surface
         self.cell = cell_of(world, dt)
         if self.cell is not None:
             mass = CellMass(world.comm, self.contact_map.source.root, self.cell)
@@ -141,19 +141,20 @@ class ContactSystem:
         self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
         if self.resistance is not None and self.attraction is not None:
             self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
-        self.at_once, self._freely = 0, freely
+        self.at_once = 0
         self._bounces = np.zeros(len(contacts), np.bool_)
         if world.pairs.bounces:
-            self._bounce(world, contacts, freely[:, 0], eased)
+            self._freely = freely
+            self._bounce(world, contacts, freely[:, 0], eased, b)
         impacts = self._bounces
         if contacts.parting is not None:
             strikes = np.isfinite(contacts.parting)
-            self.b[strikes, 0], self.compliance[strikes] = -contacts.parting[strikes], 0.0
+            b[strikes, 0], self.compliance[strikes] = -contacts.parting[strikes], 0.0
             impacts = impacts | strikes
         if smooth:
             self.mu = np.where(impacts, 0.0, self.mu)
         swing = np.zeros((0, 3)) if contacts.swing is None else contacts.swing
-        self.r = _beyond(self.b, freely, rounding, self.frame, swing, impacts, self.compliance, self.held)
+        self.r = _beyond(b, freely, rounding, self.frame, swing, impacts, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
 
@@ -201,9 +202,10 @@ class ContactSystem:
         return free, freely, rounding
 
     def _bounce(
-        self, world: World, contacts: Contacts, freely: Floats, eased: tuple[Keys, Floats] | None
+        self, world: World, contacts: Contacts, freely: Floats, eased: tuple[Keys, Floats] | None, r: Floats
     ) -> None:
-        """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton).
+        """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton), by
+        the normal numbers of r (nc, 3).
 
         They begin if without impulses they close in the step, `freely` (nc,) [m/s], and come faster than `slowest`: a
         body at rest does not bounce."""
@@ -222,7 +224,7 @@ class ContactSystem:
             place = places(eased[0], self.key)
             self._part[place >= 0] = eased[1][place[place >= 0]]
             e = e * self._part
-        self.b[begin, 0] = np.minimum(self.b[begin, 0], (e * came)[begin])
+        r[begin, 0] = np.minimum(r[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 
     def eased(self, world: World, impulse: Floats, momentum: Floats) -> tuple[Keys, Floats] | None:
@@ -361,7 +363,7 @@ def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> 
     moved = np.zeros((0, 3)) if contacts.moved is None else contacts.moved
     # the last rank, which owns the large bodies, has no ghosts: the own bodies are the first rows on all ranks
     row, body, touched, arm = _rows_of(
-        contacts.a, contacts.b, contacts.body, table.mass, owned, contacts.point, moved, table.position
+        contacts.a, contacts.b, near.index, table.mass, owned, contacts.point, moved, table.position
     )
     rows = CompactRows(frame.reshape(-1, 9), arm, body, inverse_root_masses(world, drives), owned)
     ghosts = touched.nonzero()[0]
@@ -497,9 +499,9 @@ def _beyond(b, freely, rounding, frame, swing, impacts, compliance, held):
 
 
 @loop
-def _rows_of(a, b, body, mass, owned, point, moved, position):
-    """Of contacts of bodies in the rows a and b (nc,): the rows (nc, 2), the indices `body` (nc, 2) of those that move,
-    else -1, which rows that this rank does not own they touch and move, and the arms of `contact_arms`."""
+def _rows_of(a, b, index, mass, owned, point, moved, position):
+    """Of contacts of bodies in the rows a and b (nc,): the rows (nc, 2), the `index` (nc, 2) of those that move, else
+    -1, which rows that this rank does not own they touch and move, and the arms of `contact_arms`."""
     row, moving = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64)
     touched, arm = np.zeros(len(mass), np.bool_), np.empty((len(a), 6))
     for c in range(len(a)):
@@ -507,7 +509,7 @@ def _rows_of(a, b, body, mass, owned, point, moved, position):
         for k in range(2):
             n = row[c, k]
             moves = np.isfinite(mass[n])
-            moving[c, k] = body[c, k] if moves else -1
+            moving[c, k] = index[n] if moves else -1
             if n >= owned and moves:
                 touched[n] = True
         _set_arm(c, point, moved, position, row, arm)

@@ -136,15 +136,15 @@ def _by(
     name: str, problem: ConeProblem, guess: Array, limits: Limits, options: Any, newton: Newton | None, law: str
 ) -> Result:
     """What one method makes of the problem. Impulses that are no numbers become zero."""
-    method, nothing, coulomb = SOLVERS[name], np.zeros(problem.r.shape), law == COULOMB
-    cold = problem.natural_residual(nothing, problem.r, coulomb)
+    method, coulomb = SOLVERS[name], law == COULOMB
+    cold = problem.natural_residual(np.zeros(problem.r.shape), problem.r, coulomb)
     if cold == 0:
         words = "no contact closes" if problem.size else "no contacts"
-        result = Result(nothing, Status.CONVERGED, words, 0.0, 0, solver=name, law=law)
+        result = Result(np.zeros(problem.r.shape), Status.CONVERGED, words, 0.0, 0, solver=name, law=law)
         _measure(problem, result)
         return result
     if words := why_unanswered(problem, coulomb):
-        result = Result(nothing, Status.UNBOUNDED, words, cold, 0, solver=name, law=law)
+        result = Result(np.zeros(problem.r.shape), Status.UNBOUNDED, words, cold, 0, solver=name, law=law)
         _measure(problem, result)
         return result
     limits = limits.but(max_it=method.iterations) if limits.max_it < 0 else limits
@@ -174,7 +174,7 @@ def _by(
         result.newton_its = result.iterations
     if problem.sum(int(not all_from(result.impulse.ravel(), -np.inf))):
         result.reason = f"impulses are no numbers: {result.reason}"
-        result.impulse, result.status, result.residual = nothing, Status.BREAKDOWN, cold
+        result.impulse, result.status, result.residual = np.zeros(problem.r.shape), Status.BREAKDOWN, cold
     elif unbounded := why_unbounded(problem, result.impulse):
         result.status, result.reason = Status.UNBOUNDED, unbounded
     elif result.converged and (indefinite := why_indefinite(problem)):

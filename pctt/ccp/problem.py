@@ -19,6 +19,7 @@ from dem.exchange import reduced, refuse
 from pctt.arrays import TINY, Array, all_from
 from pctt.ccp import door
 from pctt.ccp.cones import Cones, FrictionCones
+from pctt.ccp.cones.base import Units
 from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, ritz_values, without_dense_columns
 
 
@@ -107,10 +108,12 @@ class ConeProblem:
         if self.units is not None:
             self.operator = door.in_units(comm, self._given_operator, self.units)
         self.contact_map = None if isinstance(self.operator, GivenOperator) else self.operator
-        trace = float(_diagonals(self._rigid_blocks).sum())  # has squares of all numbers of G
+        blocks = self.operator.contact_blocks()  # not kept: few methods take more of them than their diagonals
+        trace = float(_diagonals(blocks).sum())  # has squares of all numbers of G
         known = self.contact_map is not None and math.isfinite(trace)
-        wrong = 0 if known else _not_finite(self._rigid_blocks)
-        here = wrong, self.cones.count, *_rows_with(self._rigid_blocks, self.compliance), self.r.size, trace
+        wrong = 0 if known else _not_finite(blocks)
+        self.diagonal = _diagonals(blocks) + self.compliance
+        here = wrong, self.cones.count, *_rows_with(self.diagonal, self.compliance), self.r.size, trace
         (*counts, trace), _ = reduced(comm, here, ())
         wrong, self.size, soft, self.unanswered, rows = map(int, counts)
         if wrong:
@@ -194,10 +197,8 @@ class ConeProblem:
 
     def product(self, g: Array) -> Array:
         """N g for impulses g (nc, 3): velocities of the contacts (nc, 3)."""
-        y = np.zeros(self.r.shape)
+        y = self.compliance * g if self.yields else np.zeros(self.r.shape)
         self.operator.add_delassus(g, y)
-        if self.yields:
-            y += self.compliance * g
         return y
 
     def momentum(self, g: Array) -> Array:
@@ -209,9 +210,9 @@ class ConeProblem:
         """G v: velocities of the contacts (nc, 3) for those of the bodies; N g where the problem is given by N."""
         return self.operator.velocities(momentum)
 
-    def errors(self, g: Array, y: Array, coulomb: bool = False, units: Array | None = None) -> Errors:
+    def errors(self, g: Array, y: Array, coulomb: bool = False, units: Units | None = None) -> Errors:
         """How far impulses g with the velocities y = N g + r are from a solution. For Coulomb's law y gets De Saxce's
-        term. Both are multiplied by ``units`` (2, nc, 3), if these are given."""
+        term. Both are in ``units``, if these are given."""
         sums, most = self.cones.errors(g, y, self.r, 1.0 / self.mean_diagonal, coulomb, units)
         (moved, whole, closing, opening, energy), (speed,) = reduced(self.comm, sums, (most,))
         natural = 0.0 if moved == 0.0 else math.sqrt(moved) / math.sqrt(whole) if whole > 0.0 else math.inf
@@ -397,16 +398,15 @@ def _put_both_tangents(given: Array, out: Array) -> None:
 
 
 @loop
-def _rows_with(blocks: Array, compliance: Array) -> tuple[int, int]:
-    """How many rows (n, 3) of C have compliance, and in how many the diagonal of N is zero, for the rigid blocks
-    (n, 3, 3)."""
+def _rows_with(diagonal: Array, compliance: Array) -> tuple[int, int]:
+    """How many rows (n, 3) of C have compliance, and in how many the diagonal of N (n, 3) is zero."""
     soft, unanswered = 0, 0
     for c in range(len(compliance)):
         gives = False
         answers = False
         for k in range(3):
             gives = gives or compliance[c, k] > 0.0
-            answers = answers or blocks[c, k, k] + compliance[c, k] != 0.0
+            answers = answers or diagonal[c, k] != 0.0
         soft, unanswered = soft + gives, unanswered + (not answers)
     return soft, unanswered
 

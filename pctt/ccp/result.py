@@ -220,6 +220,14 @@ class Result:
         """The residual that the law of the result stands for."""
         return found.natural_residual if self.law == RELAXATION else found.coulomb_residual
 
+    @property
+    def cost(self) -> Result:
+        """The result without what it has found: enough for `after`."""
+        none = np.zeros((0, 3))
+        return dataclasses.replace(
+            self, impulse=none, velocity=none, momentum=none, states=np.zeros(0, np.int8), asked=None
+        )
+
     def after(self, *earlier: Result) -> Result:
         """This result, with what the results before it have cost."""
         for result in earlier:

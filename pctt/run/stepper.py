@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import resource
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +25,7 @@ from dem.step.impacts import in_order
 from dem.step.impulses import ImpulseMemory
 from dem.step.system import ContactSystem
 from dem.together import SceneError
-from dem.unconstrained import unconstrained
+from dem.unconstrained import UnconstrainedMotion, unconstrained
 from pctt import ccp, log
 from pctt.arrays import Array
 from pctt.ccp.cones import Cones
@@ -111,7 +113,7 @@ class Stepper:
             wrap(world)  # into the periodic cell
             rebalance(world)
             free = unconstrained(world, given.dt)  # gravity, spin, loads, springs, drives, motions
-            contacts = in_order(world, find_contacts(world, given.delta, free), free)
+            contacts = self._with_lists(world, in_order(world, find_contacts(world, given.delta, free), free))
         while True:
             with log.phase("assembly"):
                 last, kept = self._recalled(world, contacts)
@@ -138,9 +140,13 @@ class Stepper:
                 if missed is other is less is None:
                     files = self._dumped(system, problem, guess, result)
                     break
-            found = _remembered(world, system, result)
-            contacts = contacts if missed is None else missed
+            found, result = _remembered(world, system, result), result.cost
             free, eased = other or free, less or eased
+            del system, problem, guess, last, kept, velocity  # before others take as much memory
+            if missed is not None:
+                del contacts
+                with log.phase("search"):
+                    contacts = self._with_lists(world, missed())
         _refuse_squeezed(world, result)
         with log.phase("advance"):
             system.take_flow(world, contacts)
@@ -148,6 +154,12 @@ class Stepper:
             step = Step(world, contacts, system, *system.parts(result.impulse))
             held, kept = system.held_after(result.impulse), system.keep(world, result.impulse, result.momentum)
         return NewStep(step, self._figures(world, problem.size, result, files), held, kept)
+
+    def _with_lists(self, world: World, contacts: Contacts) -> Contacts:
+        """The contacts, whose lists take the place of those of both worlds: these take memory, and any that hold lead
+        to the same contacts."""
+        self.world.lists = world.lists = contacts.lists
+        return contacts
 
     def _recalled(self, world: World, contacts: Contacts) -> tuple[Array, Array]:
         """The impulses (parts nc, 3) of the last step of these contacts, and what laws kept of them (nc, columns)."""
@@ -179,21 +191,21 @@ class Stepper:
 
     def _missed(
         self, world: World, system: ContactSystem, velocity: Array, turned: int
-    ) -> tuple[Contacts | None, int]:
-        """The contacts, with those that these velocities (owned, 6) show to be missed; None if there are none. A few
-        times a step with those that overlap at its end because bodies turn, by a tenth of delta: and how often now."""
+    ) -> tuple[Callable[[], Contacts] | None, int]:
+        """What finds the contacts, with those that these velocities (owned, 6) show to be missed; None if there are
+        none. A few times a step with those that overlap at its end because bodies turn, by a tenth of delta: and how
+        often now."""
         settings, contacts, free = self.settings, system.contacts, system.motion
         delta, recovery = settings.delta, settings.recovery_speed
         left = settings.dt * self._limits.closing_speed  # what a solution may leave of an overlap
         deep = max(0.01 * delta, left if left < np.inf else 0.0)
-        wider = find_overrun(world, free, contacts, velocity, delta, deep, recovery)
-        if wider is not None:
-            wider = in_order(world, wider, free)
-            return carried(world, contacts, wider) if turned else wider, turned
+        search = find_overrun(world, free, contacts, velocity, delta, deep, recovery)
+        if search is not None:
+            return partial(_wider, world, free, search, contacts if turned else None), turned
         if turned < TRIES and not world.only_spheres:
             anew = find_turned(world, free, contacts, velocity, 0.1 * delta, recovery, turned)
             if anew is not None:
-                return anew, turned + 1
+                return lambda: anew, turned + 1
         refuse_passages(world, free, contacts, velocity, delta)
         return None, turned
 
@@ -235,6 +247,14 @@ class Stepper:
             "peak_memory": _peak_memory(world.comm),
             "phases": log.take_seconds(phases),
         }
+
+
+def _wider(
+    world: World, free: UnconstrainedMotion, search: Callable[[], Contacts], turned: Contacts | None
+) -> Contacts:
+    """The contacts of a search, with those that were linearised anew."""
+    wider = in_order(world, search(), free)
+    return wider if turned is None else carried(world, turned, wider)
 
 
 def _remembered(world: World, system: ContactSystem, found: ccp.Result) -> ImpulseMemory:

@@ -53,7 +53,7 @@ from dem.motion import Fixed
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
-from dem.step.system import ContactSystem
+from dem.step.system import ContactSystem, gap_velocities
 from dem.unconstrained import unconstrained
 from pctt import ccp
 from pctt.scenes import Mixer
@@ -115,7 +115,8 @@ def assembled(state: State, contacts: Contacts) -> Step:
     arms = [contacts.point - half - position[contacts.a], contacts.point + half - position[contacts.b]]
     arm = np.ascontiguousarray(np.hstack(arms))
     G = ContactMap(COMM, replace(system.contact_map.source, arm=arm))
-    r = system.b + G.relative_velocities(np.vstack([system.free_velocity, np.zeros(6)]))
+    r = G.relative_velocities(np.vstack([system.free_velocity, np.zeros(6)]))
+    r[:, 0] += gap_velocities(world, contacts, dt, np.inf)[2]
     on_floor = contacts.body[:, 1] == world.slabs[-1] + _floor(world)
 
     def floor_force(impulse: np.ndarray) -> float:

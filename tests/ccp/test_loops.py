@@ -34,8 +34,8 @@ def accelerated_step(x, last_x, y, compliance, beta, step, mu, opening):
     return work, np.vdot(out - z, out - z), np.vdot(y_z, out - x), out
 
 
-def errors(x, y, r, step, mu, opening, units):
-    x, y = (x * units[0], y * units[1]) if len(units) else (x, y)
+def errors(x, y, r, step, mu, opening, unit=1.0, size=()):
+    x, y = (x * unit / size, y * unit * size) if len(size) else (x, y)
     term = opening * mu * np.hypot(y[:, 1], y[:, 2])
     move, power = nearest(x - step * (y + np.outer(term, [1, 0, 0])), mu) - x, (x * y).sum(axis=1)
     works = x[:, 0] @ np.maximum(-y[:, 0], 0), np.maximum(power, 0).sum(), 0.5 * np.vdot(x, y - r)
@@ -79,13 +79,13 @@ class Sample:
         x, dx, y, dy = rng.normal(size=(4, count, 3))
         x[::7] = 0.0
         x[3::7, 1:] = 0.0
-        blocks, units = rng.normal(size=(count, 3, 3)), rng.uniform(0.5, 2.0, size=(2, count, 3))
+        blocks, size = rng.normal(size=(count, 3, 3)), rng.uniform(0.5, 2.0, size=(count, 3))
         self.cases = {
             "project": (cone.project, nearest, (x, mu)),
             "step": (stepped, accelerated_step, (x, dx, y, np.abs(dy), 0.7, 0.3, mu, 1.0)),
             "rigid step": (stepped, accelerated_step, (x, dx, y, dy[:0], 0.7, 0.3, mu, 0.0)),
-            "errors": (cone.errors, errors, (x, y, dy, 0.3, mu, 0.0, units)),
-            "errors of Coulomb's law": (cone.errors, errors, (x, y, dy, 0.3, mu, 1.0, units[:0])),
+            "errors": (cone.errors, errors, (x, y, dy, 0.3, mu, 0.0, 0.7, size)),
+            "errors of Coulomb's law": (cone.errors, errors, (x, y, dy, 0.3, mu, 1.0, 0.7, size[:0])),
             "times": (cone.times, times, (blocks, x)),
         }  # fmt: skip
 
@@ -140,7 +140,7 @@ def test_sums_of_a_problem_from_its_cones():
     term = np.stack([mu * np.hypot(y[:, 1], y[:, 2]), 0 * mu, 0 * mu], axis=1)
     for coulomb, target in ((False, x - 0.3 * y), (True, x - 0.3 * (y + term))):
         np.testing.assert_allclose(cones.move(x, y, 0.3, coulomb), nearest(target, mu) - x, atol=1e-14)
-        for one, other in zip(cones.errors(x, y, x, 0.3, coulomb), errors(x, y, x, 0.3, mu, coulomb, [])):
+        for one, other in zip(cones.errors(x, y, x, 0.3, coulomb), errors(x, y, x, 0.3, mu, coulomb)):
             np.testing.assert_allclose(one, other)
     open_ones = (x[:, 0] <= 0) & (y[:, 0] - term[:, 0] > 0.1)
     assert np.array_equal(cones.active(x, x, y, 0.1), ~open_ones)

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from pctt.arrays import Array, all_from
 from pctt.ccp.cones.lorentz import LorentzForm, joined, rows, step_inside
 
+#: A number u and sizes s (rows, 3) of unknowns: u / s is the unit of impulses, u s that of velocities.
+Units = tuple[float, Array]
+
 
 class Cones(ABC):
     """The cones of all contacts of this rank, each of which is met by discs: with parts p of a contact's numbers beside
@@ -125,10 +128,10 @@ class Cones(ABC):
 
     @abstractmethod
     def errors(
-        self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None
+        self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Units | None = None
     ) -> tuple[Sequence[float], float]:
         """||`move`||^2, |g|^2, closing work, opening work and 1/2 g.(y - r) of this rank's contacts, and the
-        greatest speed at which one closes. ``units`` (2, rows, 3) multiply g and y."""
+        greatest speed at which one closes. With ``units`` g and y are in these."""
 
     def active(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
         """Mask (count,) of the contacts but those without an impulse at x and last_x whose distance inside the dual

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from dem.compiled import PART, inlined, loop, prange
 from pctt.arrays import Array, tangential
-from pctt.ccp.cones.base import Cones, floats
+from pctt.ccp.cones.base import Cones, Units, floats
 
-_NONE = np.empty((0, 0, 3))
+_NONE = 1.0, np.empty((0, 3))
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to the next
 NO_MOVE = 64.0 * float(np.finfo(float).eps) ** 2  # (8 eps)^2: |move|^2 / |step y|^2 that rounding makes
@@ -61,7 +61,7 @@ def active(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDArra
 
 @loop
 def errors(
-    x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float, units: Array
+    x: Array, y: Array, r: Array, step: float, mu: Array, de_saxce: float, unit: float, size: Array
 ) -> tuple[tuple[float, float, float, float, float], float]:
     """Five sums over the contacts, and the greatest -y_n, or 0.
 
@@ -69,16 +69,15 @@ def errors(
     below the rounding of step y it is zero: a contact that slides has 0 = P(-step y) only up to that; of |x|^2; and
     closing work, opening work and 1/2 x.(y - r).
 
-    ``units`` (2, nc, 3) multiply x and y, if there are any: (0, nc, 3) is none."""
+    With the sizes (nc, 3) of the unknowns, if there are any, x and y have the units unit / size and unit size."""
     sums, most = np.zeros((5, STRIP)), np.zeros(STRIP)
-    g, v, scaled = np.empty(3 * STRIP), np.empty(3 * STRIP), len(units) > 0
-    x, y, r = x.ravel(), y.ravel(), r.ravel()
+    g, v, scaled = np.empty(3 * STRIP), np.empty(3 * STRIP), len(size) > 0
+    x, y, r, size = x.ravel(), y.ravel(), r.ravel(), size.ravel()
     for first in range(0, len(mu), STRIP):
         friction = mu[first : first + STRIP]
         a, b = 3 * first, 3 * (first + len(friction))
         if scaled:
-            _multiply(x[a:b], units[0].ravel()[a:b], g)
-            _multiply(y[a:b], units[1].ravel()[a:b], v)
+            _in_units(x[a:b], y[a:b], unit, size[a:b], g, v)
         else:
             g[: b - a], v[: b - a] = x[a:b], y[a:b]
         _add_moves(g, v, step, friction, de_saxce, sums[0])
@@ -103,9 +102,9 @@ def _sum(x):
 
 
 @loop
-def _multiply(x, y, out):
+def _in_units(x, y, unit, size, g, v):
     for k in range(len(x)):
-        out[k] = x[k] * y[k]
+        g[k], v[k] = x[k] * (unit / size[k]), y[k] * (unit * size[k])
 
 
 @loop
@@ -319,10 +318,10 @@ class FrictionCones(Cones):
         return accelerated_step(x, last_x, y, compliance, beta, step, self.mu, float(coulomb), out)
 
     def errors(
-        self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None
+        self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Units | None = None
     ) -> tuple[Sequence[float], float]:
         found: tuple[Sequence[float], float]
-        found = errors(g, y, r, step, self.mu, float(coulomb), _NONE if units is None else units)
+        found = errors(g, y, r, step, self.mu, float(coulomb), *(units or _NONE))
         return found
 
     def active(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from dem.compiled import inlined, loop
 from pctt.arrays import Array, tangential
-from pctt.ccp.cones.base import Cones, floats
+from pctt.ccp.cones.base import Cones, Units, floats
 from pctt.ccp.cones.friction import (
     NO_MOVE,
     ONE,
@@ -68,9 +68,11 @@ class RollingCones(Cones):
 
     @np.errstate(over="ignore", invalid="ignore")  # impulses may be no numbers
     def errors(
-        self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Array | None = None
+        self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Units | None = None
     ) -> tuple[Sequence[float], float]:
-        g, y = (g, y) if units is None else (g * units[0], y * units[1])
+        if units is not None:
+            unit, size = units
+            g, y = g * (unit / size), y * (unit * size)
         both = self.move(g, y, step, coulomb), step * y
         move, speed = (np.square(z).sum(axis=1).reshape(2, -1).sum(axis=0) for z in both)
         normal, push = y[: self.count, 0], g[: self.count, 0]

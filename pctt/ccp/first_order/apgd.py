@@ -79,12 +79,13 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     """The best impulses that accelerated projected steps find from a first guess."""
     scaled, coulomb = progress.problem, progress.problem.coulomb
     now = scaled.iterate(scaled.start(guess))
-    last, new, y = now.copy(), now.copy(), np.empty(now.x.shape, now.x.dtype)
+    last, new, gradient = now.copy(), now.copy(), np.empty_like(now.x)
+    y = gradient
     lipschitz, whole = options.lipschitz, True
     theta, beta, step, least = options.theta, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, its least since beta = 0
     while True:
         if progress.is_due(math.sqrt(step)):
-            now, last, new, y = scaled.restore(now, last, new)
+            (now, last, new), y = scaled.restore(now, last, new), gradient
             if not progress.goes_on(now.x, scaled.look(now, y)):
                 return progress.impulse
             whole = True

@@ -28,13 +28,15 @@ Rows = NDArray[np.intp]
 
 
 class Iterate(NamedTuple):
-    """A point x (nc, 3), and its image: what it does to the bodies (`ContactMap.image`)."""
+    """A point x, and its image: what it does to the bodies (`ContactMap.image`)."""
 
-    x: Array
+    x: Array  #: (n, 3) of the active set
     image: Array
+    room: Array  #: (nc, 3) the memory of x, for all contacts
 
     def copy(self) -> Iterate:
-        return Iterate(self.x.copy(), self.image.copy())
+        x = self.x.copy()
+        return Iterate(x, self.image.copy(), x)
 
 
 class ActiveSet(NamedTuple):
@@ -65,26 +67,31 @@ class ScaledProblem:
         self.problem, self.coulomb, self.precision = problem, coulomb, precision
         shape = problem.r.shape
         self.unit = 2.0 ** math.frexp(problem.max(_largest(problem.r)))[1]
-        self.shrink, self._units = np.empty(shape), np.empty((2, *shape))  # the diagonal of S^-1; of x, of a gradient
-        self._impulse, self._velocity = self._units
+        self.size = np.empty(shape)  # the diagonal of S
         self.b, self._compliance = np.empty((2, *shape), precision)
         given = problem.diagonal, problem.mean_diagonal, self.unit, problem.r, problem.compliance
-        _scale(*given, (self.shrink, self._impulse, self._velocity), self.b, self._compliance)
-        self.cones = problem.cones.scaled(self._velocity, precision)
+        _scale(*given, self.size, self.b, self._compliance)
+        self.cones = problem.cones.scaled(self.size, precision)
         self._operator = problem.operator.scaled(self.shrink, precision)
         soft = self._compliance[: None if problem.yields else 0]
         self._all = self._active = ActiveSet(None, self._operator, self.cones, self.b, soft)
+
+    @property
+    def shrink(self) -> Array:
+        """The diagonal of S^-1 (nc, 3)."""
+        return 1.0 / self.size
 
     def _rounded(self, x: Array) -> Array:
         return x.astype(self.precision, copy=False)
 
     def start(self, guess: Array) -> Array:
         """The scaled point of a first guess of the impulses (nc, 3), in the cones."""
-        return self.project(self._rounded(guess / self._impulse))
+        return self.project(self._rounded(guess / (self.unit / self.size)))
 
     def impulse(self, x: Array) -> Array:
         """The impulses (nc, 3) of x, in the cones in double precision too."""
-        g = x * self._impulse
+        g = self.unit / self.size
+        g *= x
         return g if self.precision is np.float64 else self.problem.cones.project(g, g)
 
     def product(self, x: Array) -> Array:
@@ -106,8 +113,8 @@ class ScaledProblem:
 
     def iterate(self, x: Array) -> Iterate:
         """The iterate at x (nc, 3), which is kept."""
-        found = Iterate(x, self._operator.image())
-        self._operator.find_image(*found)
+        found = Iterate(x, self._operator.image(), x)
+        self._operator.find_image(x, found.image)
         return found
 
     def rigid_gradient(self, now: Iterate, last: Iterate, beta: float, out: Array) -> Array:
@@ -120,18 +127,13 @@ class ScaledProblem:
         self.rigid_gradient(now, now, 0.0, y)
         return y + self._compliance * now.x if self.problem.yields else y
 
-    def restore(self, now: Iterate, last: Iterate, new: Iterate) -> tuple[Iterate, Iterate, Iterate, Array]:
-        """The iterates with all contacts, memory for a new one, and memory (nc, 3) for a gradient."""
+    def restore(self, now: Iterate, last: Iterate, new: Iterate) -> list[Iterate]:
+        """The iterates with all contacts, of which the last is memory for a new one."""
         rows, self._active = self._active.rows, self._all
         if rows is not None:
-            now, last = self._scattered(now, rows), self._scattered(last, rows)
-        x, y = np.empty((2, *self.b.shape), self.b.dtype)
-        return now, last, Iterate(x, new.image), y
-
-    def _scattered(self, iterate: Iterate, rows: Rows) -> Iterate:
-        x = np.zeros_like(self.b)
-        _put(rows, iterate.x, x)
-        return Iterate(x, iterate.image)
+            for iterate in (now, last):
+                _spread(rows, iterate.room)
+        return [Iterate(room, image, room) for _, image, room in (now, last, new)]
 
     def restrict(
         self, now: Iterate, last: Iterate, new: Iterate, y: Array, length: float
@@ -139,7 +141,7 @@ class ScaledProblem:
         """Leave out contacts that will stay open until the next look, as far as one can see: they have no impulse, and
         open five times faster than steps change velocities, which is the root mean square of their ``length`` |L step|.
         A contact too many costs iterations, but no accuracy. ``y`` (nc, 3) is the rigid gradient of all contacts.
-        Returns what `restore` does, of the active set, with this gradient: fewer, side by side, move fewer bytes."""
+        Returns what `restore` does and this gradient, of the active set: fewer, side by side, move fewer bytes."""
         every = self._all
         if not every.operator.has_parts:
             return now, last, new, y
@@ -152,18 +154,21 @@ class ScaledProblem:
         def active(array: Array) -> Array:
             return np.take(array, rows, axis=0) if len(array) else array
 
-        now, last, y = Iterate(active(now.x), now.image), Iterate(active(last.x), last.image), active(y)
+        for room in (now.room, last.room, y):
+            _gather(rows, room)
         assert isinstance(every.operator, ContactMap)
         operator, cones = every.operator.only(contacts), self.cones.only(contacts)
         self._active = ActiveSet(rows, operator, cones, active(every.b), active(every.compliance))
-        return now, last, Iterate(np.empty(y.shape, y.dtype), new.image), y
+        here = slice(len(rows))
+        now, last, new = (Iterate(room[here], image, room) for _, image, room in (now, last, new))
+        return now, last, new, y[here]
 
     def step(self, now: Iterate, last: Iterate, beta: float, y: Array, length: float, new: Iterate) -> Sequence[float]:
         """The projected step of this length from z, where the rigid gradient is y, into ``new``; of the step d from z
         d'Ad and |d|^2, and y_z'(x_new - x), with y_z the gradient at z with the De Saxce term of Coulomb's law."""
         _, operator, cones, _, soft = self._active
         work, square, uphill = cones.accelerated_step(now.x, last.x, y, soft, beta, length, self.coulomb, new.x)
-        operator.find_image(*new)
+        operator.find_image(new.x, new.image)
         work += operator.energy_of_step(new.image, now.image, last.image, beta)
         return self.problem.sums(work, square, uphill)
 
@@ -181,13 +186,14 @@ class ScaledProblem:
 
     def block_steps(self) -> Array:
         """1 over the largest eigenvalue of each contact's diagonal block of A, per unknown (nc, 3)."""
-        blocks = self.problem.diagonal_blocks * (self.shrink[:, :, None] * self.shrink[:, None, :])
+        shrink = self.shrink
+        blocks = self.problem.diagonal_blocks * (shrink[:, :, None] * shrink[:, None, :])
         largest = np.linalg.eigvalsh(blocks)[:, -1]
         return np.repeat(1.0 / np.where(largest > 0, largest, 1.0), 3).reshape(-1, 3)
 
     def errors(self, x: Array, gradient: Array) -> Errors:
         """Of the impulses of x, but for rounding in the cones, and the velocities N g + r of its gradient A x + b."""
-        return self.problem.errors(x, gradient, self.coulomb, self._units)
+        return self.problem.errors(x, gradient, self.coulomb, (self.unit, self.size))
 
     def largest_curvature(self, steps: int = 10) -> float:
         """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""
@@ -214,26 +220,35 @@ def _largest(r):
 
 
 @loop
-def _scale(diagonal, mean, unit, r, compliance, units, b, soft):
-    """Fill in five arrays (nc, 3) of a `ScaledProblem`, for the diagonal of N, its mean, and the unit."""
-    shrink, impulse, velocity = units
+def _scale(diagonal, mean, unit, r, compliance, sizes, b, soft):
+    """Fill in three arrays (nc, 3) of a `ScaledProblem`, for the diagonal of N, its mean, and the unit."""
     for c in range(len(r)):
         normal, tangential = diagonal[c, 0], 0.5 * (diagonal[c, 1] + diagonal[c, 2])
         normal = np.sqrt(normal if normal > 0.0 else mean)
         tangential = np.sqrt(tangential if tangential > 0.0 else mean)
         for k in range(3):
             size = tangential if k else normal
-            shrink[c, k] = 1.0 / size
-            impulse[c, k], velocity[c, k] = unit / size, unit * size
-            b[c, k], soft[c, k] = r[c, k] / velocity[c, k], compliance[c, k] * (shrink[c, k] * shrink[c, k])
+            sizes[c, k], shrink = size, 1.0 / size
+            b[c, k], soft[c, k] = r[c, k] / (unit * size), compliance[c, k] * (shrink * shrink)
 
 
 @loop
-def _put(rows, x, out):
-    """out[rows] = x (n, 3)."""
+def _gather(rows, x):
+    """Move the rows (n,) of x (nc, 3), which ascend, to its first rows."""
     for k in range(len(rows)):
         c = rows[k]
-        out[c, 0], out[c, 1], out[c, 2] = x[k, 0], x[k, 1], x[k, 2]
+        x[k, 0], x[k, 1], x[k, 2] = x[c, 0], x[c, 1], x[c, 2]
+
+
+@loop
+def _spread(rows, x):
+    """Move the first rows of x (nc, 3) to the rows (n,), which ascend; the others become zero."""
+    k = len(rows) - 1
+    for c in range(len(x) - 1, -1, -1):
+        here = k >= 0 and rows[k] == c
+        for i in range(3):
+            x[c, i] = x[k, i] if here else 0.0
+        k -= here
 
 
 @dataclass(frozen=True)
@@ -329,7 +344,8 @@ class Progress:
             if self.limits.tol < residual < np.inf:
                 return residual
         g, problem = self.problem.impulse(x), self.problem.problem
-        y = problem.product(g) + problem.r  # in double precision
+        y = problem.product(g)  # in double precision
+        y += problem.r
         if not math.isfinite(problem.dot(g, y)):
             return math.nan
         return self._judge(problem.errors(g, y, self.problem.coulomb), x)
