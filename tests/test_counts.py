@@ -342,7 +342,7 @@ def calls(patch: pytest.MonkeyPatch) -> Counter[str]:
 WALLS = [((1, 0, 0), (0, 0, 0)), ((-1, 0, 0), (0.84, 0, 0)), ((0, 1, 0), (0, 0, 0)), ((0, -1, 0), (0, 0.84, 0))]
 
 
-GROUPS = (methods, systems, trains, preconditioners, steps, flows, calls)
+GROUPS = (methods, systems, trains, preconditioners, flows, steps, calls)
 
 
 @pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)
