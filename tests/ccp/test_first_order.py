@@ -54,6 +54,9 @@ def test_the_scaled_problem_is_the_same_problem(given):
     assert np.allclose(scaled.block_steps()[:, 0], [1 / np.linalg.eigvalsh(block)[-1] for block in blocks])
     largest = np.linalg.eigvalsh(dense)[-1]
     assert 0.8 * largest <= scaled.largest_curvature(50) <= largest * (1 + 1e-12)
+    there, zero = scaled.gradient(x), np.zeros_like(x)
+    assert scaled.curvature(x, there, zero, scaled.b) == pytest.approx(x.ravel() @ dense @ x.ravel() / np.vdot(x, x))
+    assert scaled.curvature(x, there, x, there) == np.inf
     y = scaled.gradient(scaled.start(g))
     start = scaled.impulse(scaled.start(g))
     expected = problem.natural_residual(start, problem.product(start) + problem.r)

@@ -195,6 +195,12 @@ class ScaledProblem:
         """Of the impulses of x, but for rounding in the cones, and the velocities N g + r of its gradient A x + b."""
         return self.problem.errors(x, gradient, self.coulomb, (self.unit, self.size))
 
+    def curvature(self, x: Array, gradient: Array, other: Array, there: Array) -> float:
+        """d'Ad / d'd of the way d from another point to x, by the gradients (nc, 3) at both; inf where d is zero."""
+        way = x - other
+        work, square = self.dots((way, gradient - there), (way, way))
+        return max(float(work / square), 0.0) if square > 0 else np.inf
+
     def largest_curvature(self, steps: int = 10) -> float:
         """Estimate from below of the largest eigenvalue of A: ``steps`` power iterations from b."""
         x = self.b
