@@ -171,7 +171,7 @@ def _shape_of(moments):
     return moments[0] / largest, moments[1] / largest, moments[2] / largest
 
 
-@loop
+@inner
 def _spin_of(inertia, momentum, start, half):
     """The spin w with exp(half w) I w = momentum, by Newton's method from `start`, and whether it was found. All are in
     the frame of the body."""
@@ -197,14 +197,14 @@ def _spin_of(inertia, momentum, start, half):
     return (in_frame[0] / inertia[0], in_frame[1] / inertia[1], in_frame[2] / inertia[2]), found
 
 
-@loop
+@inner
 def _slope(along, axis, rotation, sine, versed, middle, half):
     """How the angular momentum in the middle of the step changes with the spin about an axis."""
     about = turned(axis, rotation, 0.5, 1.0 / 6.0)
     return plus(turned(along, rotation, sine, versed), -half, cross(middle, about))
 
 
-@loop
+@inner
 def _solve(a, b, c, right):
     """The solution of a matrix with columns a, b, c, by Cramer's rule."""
     across = cross(b, c)
@@ -212,6 +212,6 @@ def _solve(a, b, c, right):
     return over * dot(right, across), over * dot(a, cross(right, c)), over * dot(a, cross(b, right))
 
 
-@loop
+@inner
 def _each(a, b):
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]

@@ -16,7 +16,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 import numpy as np
-from numba.core import caching, config, event, types
+from numba.core import caching, compiler_machinery, config, event, types
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import CPUDispatcher
 
@@ -46,6 +46,27 @@ class _NoCollection(event.Listener):
 
 
 event.register("numba:compile", _NoCollection())
+
+
+def _remembered(ask: Callable[..., Any]) -> Callable[..., Any]:
+    """What operators and indices of arrays and numbers return, asked once: numba tries all that it knows at each place,
+    of lists and texts too, which took a seventh of the seconds of compilation."""
+    known: dict[Any, Any] = {}
+
+    def answer(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        plain = args and isinstance(args[0], (types.Array, types.Number, types.Boolean))
+        if kws or not plain or getattr(self.typing_key, "__module__", "") != "_operator":
+            return ask(self, context, args, kws)
+        key = self.key, context, tuple(args)
+        if key not in known:
+            known[key] = ask(self, context, args, kws), self  # which knows what does it
+        return known[key][0]
+
+    return answer
+
+
+compiler_machinery.pformat = repr  # numba lays out its flags for each pass of each function: a 20th of the time
+types.BaseFunction.get_call_type = _remembered(types.BaseFunction.get_call_type)
 
 _PLAIN = (int, float, complex, str, bytes, type(None), np.generic, np.dtype, enum.Enum)
 

@@ -339,8 +339,11 @@ def mean_velocity(motion: Prescribed, time: float, dt: float, position: Floats, 
 
 def velocity_between(start: Pose, end: Pose, dt: float) -> Floats:
     """Velocity (6,) that takes a body from one of its poses to another in dt [s]."""
-    turning = quaternion.rotation_vector(start[1], end[1]) / dt if (start[1] != end[1]).any() else np.zeros(3)
-    return np.concatenate([(end[0] - start[0]) / dt, turning])
+    velocity = np.zeros(6)
+    velocity[:3] = (end[0] - start[0]) / dt
+    if start[1].tolist() != end[1].tolist():
+        velocity[3:] = quaternion.rotation_vector(start[1], end[1]) / dt
+    return velocity
 
 
 #: What classes of motions might define, and what the program asks of those of a kind.

@@ -66,6 +66,7 @@ class Course(NamedTuple):
 
 
 Moving = tuple[Floats, Floats, Bools, float]  #: a `Course`
+Paired = tuple[Ints, Ints, Ints, Floats]  #: of pairs rows of shapes (m,), of contacts the pair (nc,), the reach (m,)
 Touching = tuple[Floats, Floats, Floats, Bools]  #: a `Touch`, and which are of `dem.contact.primitives.on_faces`
 
 
@@ -103,21 +104,21 @@ def seen_from(
 
 @loop
 def turn_ahead(
-    forms: Forms, poses: Poses, inner: Floats, course: Moving, i: Ints, j: Ints, pair: Ints, touch: Touching,
-    arcs: Floats,
-) -> tuple[Floats, Floats, Floats, Ints]:  # fmt: skip
+    forms: Forms, poses: Poses, inner: Floats, course: Moving, pairs: Paired, touch: Touching, arcs: Floats
+) -> tuple[Floats, Floats, Floats, Ints, int]:
     """Give contacts (nc,) of the pairs of rows i, j (m,) of the shapes the normals of the end of a step and the places
     of its start, of bodies of prescribed motion those of its end: `point` is as seen from the present place of body i.
     Returns (nc, 3) from body j to where it is relative to i for that [m]; by how much (nc, 3) the mean velocities of
     surfaces along each other, of j relative to i, differ from those with these arms [m/s]; and the gaps (nc,) from
     which gaps that are linear in the velocities lead to those of the end [m]. Contacts of guests in the places of
-    `seen_from` get these as their `gap`; returns also which of them overlap by more than DEEP so.
+    `seen_from` get these as their `gap`; returns also which of them overlap by more than DEEP so, and how many contacts
+    have a gap that is wider than the reach of their pair.
 
     `arcs` (nc, 4, 3) are as of `dem.contact.convex.arcs_of`; empty without such shapes."""
     (kind, row, size, _), (center, quaternion) = forms, poses
-    (place, velocity, moves, dt), (point, normal, gap, on_face) = course, touch
+    (place, velocity, moves, dt), (i, j, pair, reach), (point, normal, gap, on_face) = course, pairs, touch
     moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
-    deep, found = np.empty(len(pair), np.int64), 0
+    deep, found, wide = np.empty(len(pair), np.int64), 0, 0
     for c in range(len(pair)):
         one, two = i[pair[c]], j[pair[c]]
         swap = guest_is_second(kind[one], kind[two])
@@ -192,7 +193,9 @@ def turn_ahead(
             point[c, k] = at[k] + first[k]
             moved[c, k] = point[c, k] - second[k] - to[k]
             swing[c, k] = sign * more[k]
-    return moved, swing, linear, deep[:found]
+    for c in range(len(pair)):
+        wide += gap[c] > reach[pair[c]]
+    return moved, swing, linear, deep[:found], wide
 
 
 @inlined

@@ -21,7 +21,18 @@ import numpy as np
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, CAPSULE, CONVEX, POLYHEDRON, SPHERE, enclosing_radius, half_thickness
 from dem.compiled import inlined, loop
-from dem.contact.ahead import Forms, Moving, Poses, Touching, after_turn, ahead_by, guest_is_second, spun, vector_of
+from dem.contact.ahead import (
+    Forms,
+    Moving,
+    Paired,
+    Poses,
+    Touching,
+    after_turn,
+    ahead_by,
+    guest_is_second,
+    spun,
+    vector_of,
+)
 from dem.contact.narrow import DISTINCT, ContactBuffer, Manifold, Planes, joined
 from dem.contact.polyhedra import Hulls, Polyhedra, polyhedra_planes
 from dem.contact.simplex import CLOSE, ROUND, SNAP, nearer, no_simplex
@@ -619,7 +630,7 @@ def _planes(body, form, vertices, faces, plane, delta, contacts):
 
 @loop
 def arcs_of(
-    forms: Forms, poses: Poses, inner: Floats, course: Moving, i: Ints, j: Ints, pair: Ints, touch: Touching,
+    forms: Forms, poses: Poses, inner: Floats, course: Moving, pairs: Paired, touch: Touching,
     supports: tuple[Ints, Floats, Floats, Floats],
 ) -> Floats:  # fmt: skip
     """Of contacts (nc,) as of `dem.contact.ahead.turn_ahead`, vectors (nc, 4, 3) from what turns with the bodies to
@@ -627,7 +638,7 @@ def arcs_of(
     the step and at its start, of hosts at these two. As a surface rolls on, the contact stays where its normal is.
     Zeros of points that go with the body, and of shapes of other kinds."""
     (kind, row, size, _), (center, quaternion) = forms, poses
-    (place, velocity, _, _), (point, normal, gap, on_face) = course, touch
+    (place, velocity, _, _), (i, j, pair, _), (point, normal, gap, on_face) = course, pairs, touch
     what, numbers, radii, _ = supports
     arcs = np.zeros((len(pair), 4, 3))
     for c in range(len(pair)):

@@ -109,22 +109,27 @@ class Polyhedra(NamedTuple):
 
     def columns(self) -> tuple[Floats, Floats, Floats, Ints]:
         """Without the table of hulls, as loops take them."""
-        center, turn, scale = map(np.ascontiguousarray, self[:3])
-        return center, turn, scale, self.hull
+        return self[:4]
 
 
 @loop
-def frames_of_hulls(kind: Ints, quaternion: Floats, size: Floats, radius: Floats) -> tuple[Floats, Floats, Ints]:
-    """Frames (m, 3, 3), scales (m, 3) and rows (m,) of `Hulls`, of radii (h,), of boxes and polyhedra of these kinds,
-    quaternions and sizes (m, ...)."""
-    turn, scale, hull = np.empty((len(kind), 3, 3)), np.empty((len(kind), 3)), np.empty(len(kind), np.int64)
-    for n in range(len(kind)):
-        hull[n], frame = max(kind[n] - POLYHEDRON + 1, 0), frame_of(quaternion[n])
+def frames_of_hulls(
+    kind: Ints, center: Floats, quaternion: Floats, size: Floats, radius: Floats, rows: Ints
+) -> tuple[Floats, Floats, Floats, Ints]:
+    """Centres (m, 3), frames (m, 3, 3), scales (m, 3) and rows (m,) of `Hulls`, of radii (h,), of boxes and polyhedra
+    in these `rows` (m,) of tables of kinds, centres, quaternions and sizes (n, ...)."""
+    many = len(rows)
+    place, turn, scale = np.empty((many, 3)), np.empty((many, 3, 3)), np.empty((many, 3))
+    hull = np.empty(many, np.int64)
+    for n in range(many):
+        row = rows[n]
+        hull[n], frame = max(kind[row] - POLYHEDRON + 1, 0), frame_of(quaternion[row])
         for k in range(9):
             turn[n, k // 3, k % 3] = frame[k]
         for k in range(3):
-            scale[n, k] = size[n, 0] / radius[hull[n]] if hull[n] > 0 else size[n, k]
-    return turn, scale, hull
+            place[n, k] = center[row, k]
+            scale[n, k] = size[row, 0] / radius[hull[n]] if hull[n] > 0 else size[row, k]
+    return place, turn, scale, hull
 
 
 def polyhedra_polyhedra(first: Polyhedra, second: Polyhedra, delta: Floats) -> Manifold:

@@ -76,6 +76,8 @@ class Primitives(NamedTuple):
     surfaces: dict[int, Surface]  #: of the meshes, by row
     hulls: Hulls  #: of boxes and of the polyhedra of the scene
     supports: Supports  #: of its other convex shapes
+    curved: bool  #: whether any shape is one of `dem.shapes.CONVEX_SHAPES`
+    rolls: bool  #: whether a part of a large body is a sphere, a capsule or one of these
     members: Members | None = None  #: the spheres of clumps; None in scenes without
 
     def moved(self, rows: Ints, center: Floats, turn: Floats) -> Primitives:
@@ -117,8 +119,9 @@ class Primitives(NamedTuple):
 
     def polyhedron(self, rows: Any) -> Polyhedra:
         """Boxes are some."""
-        given = self.kind[rows], self.quaternion[rows], self.size[rows], self.hulls.radius
-        return Polyhedra(self.center[rows], *frames_of_hulls(*given), self.hulls)
+        rows = np.arange(len(self.kind)) if isinstance(rows, slice) else rows
+        given = self.kind, self.center, self.quaternion, self.size, self.hulls.radius
+        return Polyhedra(*frames_of_hulls(*given, rows), self.hulls)
 
     def solid(self, rows: Any) -> Solids:
         """Any convex shape."""
@@ -171,6 +174,8 @@ def primitives(
         surfaces={count + n: shape.surface for n, shape in enumerate(parts_of) if isinstance(shape, Mesh)},
         hulls=hulls,
         supports=supports_of(forms),
+        curved=bool((both["kind"] >= CONVEX).any()),
+        rolls=bool(is_round(columns["kind"][1]).any()),
         members=members(table.take(slice(0, count)), forms, after),
     )
 
@@ -178,6 +183,11 @@ def primitives(
 def most_numbers(features: int) -> int:
     """The most numbers of shapes: of the two numbers of a key one is this times a feature of so many."""
     return 2**53 // features
+
+
+def is_round(kind: Ints) -> Bools:
+    """Which shapes of kinds (n,) are round."""
+    return (kind == SPHERE) | (kind == CAPSULE) | (kind >= CONVEX)
 
 
 def extents(shapes: list[tuple[Shape, ...]]) -> Floats:
@@ -209,14 +219,12 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
     found = [Manifold(pair, np.zeros(len(pair), np.int64), Touch(point, normal, gap))]
     if not len(others):
         return found[0]
-    guest, host, swap, code = guests_and_hosts(table.kind, i, j, others)
-    for kinds in np.bincount(code).nonzero()[0].tolist():
-        if divmod(kinds, 8) in _TOUCH:
-            rows = (code == kinds).nonzero()[0]
-            reach = delta[others[rows]]
-            pair, feature, touch = _touching(table, divmod(kinds, 8), guest[rows], host[rows], reach, course)
-            touch.normal[swap[rows[pair]]] *= -1.0
-            found.append(Manifold(others[rows[pair]], feature, touch))
+    number, guest, host, reach, sign, spans = by_kinds(table.kind, i, j, delta, others)
+    for one, two, first, end in spans.tolist():
+        if (one, two) in _TOUCH:
+            here = slice(first, end)
+            pair, feature, touch = _touching(table, (one, two), guest[here], host[here], reach[here], course)
+            found.append(Manifold(of_all(pair, number[here], sign[here], touch.normal), feature, touch))
     found = [part for part in found if len(part.pair)] or found[:1]
     return joined(found) if len(found) > 1 else found[0]
 
@@ -229,16 +237,16 @@ def touches_ahead(
     wider than `delta` there."""
     found = touches(table, i, j, delta, course)
     touch = (*found.touch, on_faces(table, i, j, found, course.moves, grains))
-    given, arcs = (*table.tables(), course[:], i, j, found.pair, touch), np.zeros((0, 4, 3))
-    if (table.kind >= CONVEX).any():
-        arcs = arcs_of(*given, table.supports[:])
-    moved, swing, linear, deep = turn_ahead(*given, arcs)
+    given = *table.tables(), course[:], (i, j, found.pair, delta), touch
+    arcs = arcs_of(*given, table.supports[:]) if table.curved else np.zeros((0, 4, 3))
+    moved, swing, linear, deep, wider = turn_ahead(*given, arcs)
     if len(deep):
         pairs, row = np.unique(found.pair[deep], return_inverse=True)
         now, least = touches(table, i[pairs], j[pairs], delta[pairs]), delta[pairs]
         np.minimum.at(least, now.pair, now.touch.gap)
         found.touch.gap[deep] = np.maximum(linear[deep], least[row])
-    if (wide := found.touch.gap > delta[found.pair]).any():
+    if wider:
+        wide = found.touch.gap > delta[found.pair]
         found = Manifold(found.pair[~wide], found.feature[~wide], found.touch.take(~wide))
         moved, swing, linear = moved[~wide], swing[~wide], linear[~wide]
     return found, moved, swing, linear
@@ -248,11 +256,10 @@ def on_faces(table: Primitives, i: Ints, j: Ints, found: Manifold, moves: Bools,
     """Which contacts (nc,) of pairs of rows i, j (m,) are of round guests on flat faces of hosts that impulses move, by
     the rows of bodies `moves`. Grains are no guests: what rests on a bed of them would tremble."""
     kind, flat = table.kind, np.zeros(len(found.pair), np.bool_)
-    is_round = (kind == SPHERE) | (kind == CAPSULE) | (kind >= CONVEX)
-    guests = is_round & (table.row >= grains)
-    if not guests.any():
+    if not table.rolls:
         return flat
-    guest, host, swap, _ = guests_and_hosts(kind, i, j, found.pair)
+    guests = is_round(kind) & (table.row >= grains)
+    guest, host, swap = guests_and_hosts(kind, i, j, found.pair)
     faces = moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)
     rows = np.flatnonzero(faces[host] & guests[guest])
     away = found.touch.normal * np.where(swap, 1.0, -1.0)[:, None]
@@ -293,7 +300,10 @@ def with_parts(first, row, kind, bodies, parts):
     its body, and the normals of half spaces turn."""
     (position, turns, sizes), (offset, own, extent) = bodies, parts
     center, turn, size = np.empty((len(row), 3)), np.empty((len(row), 4)), np.empty((len(row), 3))
-    center[:first], turn[:first], size[:first] = position[:first], turns[:first], sizes[:first]
+    for n in range(first):
+        turn[n, 3] = turns[n, 3]
+        for k in range(3):
+            center[n, k], turn[n, k], size[n, k] = position[n, k], turns[n, k], sizes[n, k]
     for n in range(first, len(row)):
         p, q, part = turns[row[n]], own[n - first], n - first
         axis, twice = vector_of(p, 1), 2.0 * p[0]
@@ -312,15 +322,58 @@ def with_parts(first, row, kind, bodies, parts):
 @loop
 def guests_and_hosts(kind, i, j, pairs):
     """Of some of the pairs of rows i, j of the shapes, by their numbers `pairs` (m,), the guests and the hosts (m,),
-    whether the second one is the guest, and 8 times the kind of the guest, as in `_TOUCH`, and that of the host."""
+    and whether the second one is the guest."""
     guest, host = np.empty(len(pairs), np.int64), np.empty(len(pairs), np.int64)
-    swap, code = np.empty(len(pairs), np.bool_), np.empty(len(pairs), np.int64)
+    swap = np.empty(len(pairs), np.bool_)
     for n in range(len(pairs)):
         a, b = i[pairs[n]], j[pairs[n]]
         swap[n] = guest_is_second(kind[a], kind[b])
         guest[n], host[n] = (b, a) if swap[n] else (a, b)
-        code[n] = 8 * kind_in_pairs(kind[guest[n]]) + kind_in_pairs(kind[host[n]])
-    return guest, host, swap, code
+    return guest, host, swap
+
+
+@loop
+def by_kinds(
+    kind: Ints, i: Ints, j: Ints, reach: Floats, pairs: Ints
+) -> tuple[Ints, Ints, Ints, Floats, Floats, Ints]:
+    """Some of the pairs of rows i, j of the shapes, by their numbers `pairs` (m,), in the order of their kinds: these
+    numbers, the guests, the hosts, the `reach`, and -1 where the second one is the guest, else 1 (m,); and for each two
+    kinds that there are, as in `_TOUCH`, these, and the first and the end of their rows (k, 4)."""
+    code, start = np.empty(len(pairs), np.int64), np.zeros(65, np.int64)
+    number, guest, host = code.copy(), code.copy(), code.copy()
+    far, sign = np.empty(len(pairs)), np.empty(len(pairs))
+    for n in range(len(pairs)):
+        one, two = kind[i[pairs[n]]], kind[j[pairs[n]]]
+        one, two = (two, one) if guest_is_second(one, two) else (one, two)
+        code[n] = 8 * kind_in_pairs(one) + kind_in_pairs(two)
+        start[code[n] + 1] += 1
+    many = 0
+    for k in range(64):
+        many += start[k + 1] > 0
+        start[k + 1] += start[k]
+    spans, found = np.empty((many, 4), np.int64), 0
+    for k in range(64):
+        if start[k + 1] > start[k]:
+            spans[found, 0], spans[found, 1], spans[found, 2], spans[found, 3] = k // 8, k % 8, start[k], start[k + 1]
+            found += 1
+    for n in range(len(pairs)):
+        a, b, to = i[pairs[n]], j[pairs[n]], start[code[n]]
+        swap = guest_is_second(kind[a], kind[b])
+        guest[to], host[to] = (b, a) if swap else (a, b)
+        number[to], far[to], sign[to] = pairs[n], reach[pairs[n]], -1.0 if swap else 1.0
+        start[code[n]] += 1
+    return number, guest, host, far, sign, spans
+
+
+@loop
+def of_all(pair: Ints, number: Ints, sign: Floats, normal: Floats) -> Ints:
+    """The `number` (m,) of the pair of each contact (nc,), whose normals (nc, 3) get its `sign` (m,)."""
+    out = np.empty(len(pair), np.int64)
+    for c in range(len(pair)):
+        out[c] = number[pair[c]]
+        for k in range(3):
+            normal[c, k] *= sign[pair[c]]
+    return out
 
 
 #: The kinds of polyhedra that are no boxes, and of other convex shapes, in pairs: clumps are their spheres there.

@@ -350,7 +350,8 @@ def greatest_travel(world: World, velocity: Floats, dt: float, further: float = 
     times; in a sheared cell, which has no large bodies, beside the flow, with what this brings pairs together [m]."""
     grains, cell = world.grains, world.cell
     beside = cell.beside_flow(grains.position, velocity)
-    return _travel(grains.shape, grains.size, arms(world.forms), beside, further * dt) + cell.margin(dt, grains)
+    travel = _travel(grains.shape, grains.size, arms(world.forms), beside, further * dt)
+    return travel + cell.margin(dt, grains) if cell.moves else travel
 
 
 @loop

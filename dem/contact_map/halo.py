@@ -45,13 +45,15 @@ class Halo:
 
     def update(self, values: np.ndarray) -> None:
         """Copy the values of the owners to the ghosts."""
-        self.begin_update(values)
-        self.end_update(values)
+        if self.talks:
+            self.begin_update(values)
+            self.end_update(values)
 
     def add(self, values: np.ndarray) -> None:
         """Add the values of the ghosts to those of the owners."""
-        self.begin_add(values)
-        self.end_add(values)
+        if self.talks:
+            self.begin_add(values)
+            self.end_add(values)
 
     def lower(self, values: np.ndarray) -> None:
         """Lower the values of the owners to the least of their ghosts."""

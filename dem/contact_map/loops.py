@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from dem.arrays import Floats
-from dem.compiled import PART, inlined, loop, prange
+from dem.compiled import PART, inlined, inner, loop, prange
 
 NUMBERS = 1536  # that stay in the nearest cache, of loops that become vectors
 
@@ -330,6 +330,24 @@ def scaled_row(root, i, x0, x1, x2, x3, x4, x5):
 
 
 @loop
+def squared(root):
+    """R^2, in the format of R."""
+    out = np.empty(root.shape)
+    for i in range(len(root)):
+        for first in range(0, root.shape[1], 6):
+            if root.shape[1] == 6:
+                for k in range(6):
+                    out[i, k] = root[i, k] * root[i, k]
+            else:
+                a, b, c = root[i, first], root[i, first + 1], root[i, first + 2]
+                d, e, f = root[i, first + 3], root[i, first + 4], root[i, first + 5]
+                out[i, first], out[i, first + 1] = a * a + b * b + c * c, a * b + b * d + c * e
+                out[i, first + 2], out[i, first + 3] = a * c + b * e + c * f, b * b + d * d + e * e
+                out[i, first + 4], out[i, first + 5] = b * c + d * e + e * f, c * c + e * e + f * f
+    return out
+
+
+@loop
 def scale(root, v, out):
     """out = R v for v and out (bodies, 6); out may have more rows."""
     for i in prange(len(root)):
@@ -364,7 +382,7 @@ def scale_extrapolated(mass, m, last_m, beta, out):
             out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(mass, i, u, v, w, x, y, z)
 
 
-@loop
+@inner
 def _scale_numbers(mass, m, last_m, beta, out):
     for k in range(len(mass)):
         out[k] = mass[k] * (m[k] + beta * (m[k] - last_m[k]))
@@ -382,7 +400,7 @@ def energy_of_step(mass, new_m, m, last_m, beta):
     return sums.sum()
 
 
-@loop
+@inner
 def _energy_of_part(mass, new_m, m, last_m, beta):
     energy = 0.0
     if mass.shape[1] == 6:
@@ -403,7 +421,7 @@ def _energy_of_part(mass, new_m, m, last_m, beta):
     return energy
 
 
-@loop
+@inner
 def _add_energies(mass, new_m, m, last_m, beta, sums):
     for k in range(len(mass)):
         d = new_m[k] - (m[k] + beta * (m[k] - last_m[k]))

@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 from dem.arrays import Floats, Ints
 from dem.contact_map import loops
-from dem.contact_map.rows import BlockRows, CompactRows, root_blocks, squared
+from dem.contact_map.rows import BlockRows, CompactRows, root_blocks
 from dem.exchange import offsets
 
 Mass = TypeVar("Mass", bound="InverseMass")
@@ -35,7 +35,7 @@ class InverseMass:
     def __init__(self, root: Floats, precision: type[np.floating] = np.float64):
         self.precision = precision
         self.root = np.ascontiguousarray(root, dtype=precision)
-        self.square = np.ascontiguousarray(squared(root), dtype=precision)
+        self.square = np.ascontiguousarray(loops.squared(root), dtype=precision)
         self.unshared = self.square  #: M^-1 of the bodies that are in no shared coordinate, else zero
         self.none = np.zeros(0, precision)  #: the rates of no cell
 

@@ -138,11 +138,3 @@ def root_blocks(root: Floats) -> Floats:
 def packed(blocks: Floats) -> Floats:
     """Symmetric blocks (n, 2, 3, 3) as (n, 12), the inverse of `root_blocks`."""
     return blocks.reshape(-1, 2, 9)[:, :, UPPER].reshape(-1, 12)
-
-
-def squared(root: Floats) -> Floats:
-    """R^2, in the format of R."""
-    if root.shape[1] == 6:
-        return root * root
-    blocks = root_blocks(root)
-    return packed(blocks @ blocks)

@@ -24,6 +24,7 @@ from dem.shapes import Plane, Shape
 
 SHEARED = 0.01  #: the shear strain of a cell in a step
 STRAINED = 0.002  #: the strain of its periods in a step
+SAME = np.eye(3)  #: no deformation
 PASSING = 0.1  #: the step, in the time d sqrt(rho / P) in which the stress of a cell closes a hole
 
 
@@ -189,20 +190,18 @@ class Cell(Named):
         beside[:, 0] -= self.shear_rate * position[:, self.gradient]
         return beside
 
-    def margin(self, dt: float, grains: Bodies) -> Floats | float:
+    def margin(self, dt: float, grains: Bodies) -> Floats:
         """What the margins (n,) of grains have beside their ways in dt [s]: the share of a grain in the way by which
         the shear, and the cell as it changes its size, bring the centres of a pair together [m]."""
-        if not self.moves:
-            return 0.0
         strain = dt * (abs(self.shear_rate) + float(np.abs(self.rate).max()))
         return strain * 3.0 * bodies.bounding_radius(grains)  # with a margin of two radii, the greatest there is
 
     def strained_since(self, then: Cell) -> tuple[Floats, float]:
         """The deformation (3, 3) that brings the images of `then` to where they are now, and by which part of their
         distance it brings points nearer to each other at most."""
-        out = np.eye(3)
         if not self.moves:
-            return out, 0.0
+            return SAME, 0.0
+        out = np.eye(3)
         out[self.axes, self.axes] = self.period[self.axes] / then.period[self.axes]
         if self.gradient is not None:
             out[0, self.gradient] = (self.shift - out[0, 0] * then.shift) / then.period[self.gradient]

@@ -38,8 +38,8 @@ def row(step: Step, scene: Experiment) -> dict[str, float]:
     out |= cell(step)
     if scene.domain is not None:
         out["grains_outside"] = outside(step, *scene.domain)
-    for body in step.world.large_bodies:
-        out.update(zip(_names_of_forces(body.name), step.force_on(body.name).tolist()))
+    for body, force in zip(step.world.large_bodies, (step.impulse_on_large / step.system.dt).tolist()):
+        out.update(zip(_names_of_forces(body.name), force))
     return out | _own(step, scene, out)
 
 
@@ -127,12 +127,12 @@ def energy_balance(step: Step) -> dict[str, float]:
     what bodies at rest have (SLOW), and what those have that go with the tool they touch.
     """
     world, near, comm, system = step.world, step.contacts.near, step.world.comm, step.system
-    first, moves = near.grains + near.ghosts, bodies.is_dynamic(world.large)
-    own = 1 if comm.rank else 2  # the large bodies count once
-    tables = ((world.grains, slice(near.grains)), (world.large, slice(first, None)))[:own]
-    of_bodies = map(sum, zip(*(_ledger(step, table, rows) for table, rows in tables)))
+    first, fixed = near.grains + near.ghosts, ~bodies.is_dynamic(world.large)
+    of_bodies = _ledger(step, world.grains, slice(near.grains))
+    if world.large_moves and comm.rank == 0:  # the large bodies count once
+        of_bodies = tuple(map(sum, zip(of_bodies, _ledger(step, world.large, slice(first, None)))))
     velocity = near.bodies.velocity.copy()
-    velocity[first:][~moves] = world.large.velocity[~moves]
+    velocity[first:][fixed] = world.large.velocity[fixed]
     mean = 0.5 * (velocity[first:] + world.large.velocity)
     normal, tangential, came, opening = works(step, step.in_cone, velocity, step.moment)
     of_springs = elastic_energies(step, came, opening)
@@ -145,14 +145,14 @@ def energy_balance(step: Step) -> dict[str, float]:
     if system.drift is not None:
         flow = -np.vdot(step.impulse, system.drift)
     whole = dict(zip(WHOLE, reduced(comm, (
-        *of_bodies, *of_springs, normal, tangential, _carried(step, ~moves), attracted, applied, belts, flow,
+        *of_bodies, *of_springs, normal, tangential, _carried(step, fixed), attracted, applied, belts, flow,
         _bounced_work(step),
     ), ())[0]))  # fmt: skip
-    holding = _holding_work(step, near.bodies.velocity[first:], mean)
+    holding = _holding_work(step, near.bodies.velocity[first:], mean) if world.large_moves else 0.0
     held_by, held_at_end = _constraint_works(step, near.bodies.velocity[: near.grains], mean)
-    driving = np.vdot(system.drive_impulse(world.large.velocity), mean) + (whole["applied"] + whole["flow"])
-    driving = driving + whole["belts"] + (holding + held_by)
-    work = driving - np.vdot(step.impulse_on_large[~moves], mean[~moves])
+    driven_by = np.vdot(system.drive_impulse(world.large.velocity), mean) if world.large_moves else 0.0
+    driving = driven_by + (whole["applied"] + whole["flow"]) + whole["belts"] + (holding + held_by)
+    work = driving - np.vdot(step.impulse_on_large[fixed], mean[fixed])
     rise, fallen = whole["kinetic"] - whole["kinetic_before"], whole["potential_before"] - whole["potential"]
     fallen = max(fallen, whole["falling"])  # the work of gravity, as that of springs, on the mean velocity of the step
     held, bent = whole["elastic_at_end"] - whole["elastic"], whole["strained_at_end"] - whole["strained"]

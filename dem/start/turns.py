@@ -8,6 +8,7 @@ they are not held beside their centres.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -70,12 +71,11 @@ class TurnWatch:
             self._held = held_beside(world.named)
         if self._told or not (world.turns_unlike_spheres or self._held):
             return ""
-        of_grains = turning_of_grains(world.grains, self._held)
-        speeds = np.concatenate([of_grains, turning_of_large(world.large, world.large_bodies)])
-        ids = np.concatenate([world.grains.id, world.large.id])
-        row = int(speeds.argmax()) if len(speeds) else -1
-        mine = (float(speeds[row]), int(ids[row])) if len(speeds) else (0.0, -1)
-        speed, id = greatest(world.comm, mine)
+        tables = [(turning_of_grains(world.grains, self._held), world.grains.id)]
+        if world.large_moves:
+            tables.append((turning_of_large(world.large, world.large_bodies), world.large.id))
+        fastest = [(float(speeds.max()), int(ids[speeds.argmax()])) for speeds, ids in tables if len(ids)]
+        speed, id = greatest(world.comm, max(fastest, key=itemgetter(0), default=(0.0, -1)))
         again = self._times + 1 if self._last in (-1, id) else 1
         self._times = again if dt * speed > SLACK * TURN else 0
         self._last = id

@@ -13,6 +13,7 @@ Source: Lubachevsky, How to simulate billiards and similar systems, Journal of C
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -25,6 +26,8 @@ from dem.contact import Contacts, velocities_about
 from dem.exchange import on_any
 from dem.geometry.vectors import cross, dot, plus
 from dem.model.world import World
+from dem.parts.ends import Constraint
+from dem.scene import kinds_of
 from dem.step.laws import slowest
 from dem.unconstrained import UnconstrainedMotion
 from dem.unconstrained.constraints import slots
@@ -66,16 +69,20 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     grains, old = near.grains + near.ghosts, table.velocity
     ball = table.shape == SPHERE
     ball[grains:] = False
-    ball[slots(world, table.id)[0]] = False
+    if kinds_of(Constraint, world.named):
+        ball[slots(world, table.id)[0]] = False
+    image = np.zeros((len(contacts), 3))
+    if world.cell.periodic:
+        image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
+    radius = np.ascontiguousarray(table.size[:, 0])
+    slow = np.full(len(contacts), dt * math.hypot(*world.gravity))
     if pairs.bounces:
         old = old.copy()
         old[grains:] = motion.prescribed
-    image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
-    radius = np.ascontiguousarray(table.size[:, 0])
-    free = velocities_about(contacts, motion.grains, old[grains:]) if pairs.bounces else old
-    forced = free[:, :3] - old[:, :3]
-    closing = np.einsum("ci,ci->c", contacts.normal, forced[contacts.a] - forced[contacts.b])
-    slow = slowest(world, contacts, dt, closing, forced)
+        free = velocities_about(contacts, motion.grains, old[grains:])
+        forced = free[:, :3] - old[:, :3]
+        closing = np.einsum("ci,ci->c", contacts.normal, forced[contacts.a] - forced[contacts.b])
+        slow = slowest(world, contacts, dt, closing, forced)
     kind, bounce, offset, marked = struck(
         (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
         (ball, table.mass, radius, table.material), (table.position, old),

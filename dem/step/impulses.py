@@ -29,7 +29,7 @@ class ImpulseMemory:
         laws `kept` (nc, columns) of them."""
         each = impulse.reshape(self._parts, len(key), 3)
         rows = [in_world(part, frame) for part in each]
-        rows += [] if kept is None else [kept]
+        rows += [] if kept is None or not kept.shape[1] else [kept]
         self.restore(key, rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1))
 
     def recall(self, key: Keys, frame: Floats, elsewhere: bool = True) -> tuple[Floats, Bools, Floats]:

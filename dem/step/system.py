@@ -387,7 +387,8 @@ def inverse_root_masses(world: World, drives: Drives) -> Floats:
     """Return M^-1/2 of the bodies whose rows this rank owns, as `CompactRows.root` has it: (owned, 6) where that is all
     on all ranks, else (owned, 12)."""
     last = world.comm.rank == world.comm.size - 1
-    tables = [world.grains, with_servos(world.large, drives)] if last else [world.grains]
+    large = with_servos(world.large, drives) if world.large_moves else world.large
+    tables = [world.grains, large] if last else [world.grains]
     if world.only_spheres and not world.large_moves:
         parts = [_inverse_roots(table.mass, table.inertia) for table in tables]
         return np.concatenate(parts) if last else parts[0]

@@ -189,7 +189,9 @@ def _measure(problem: ConeProblem, result: Result) -> Accuracy:
     """Tell the result what its impulses do to the bodies and the contacts, and how accurate they are."""
     result.momentum = problem.momentum(result.impulse)
     rigid = problem.velocity_of(result.momentum)
-    y = rigid + problem.compliance * result.impulse + problem.r
+    y = rigid + problem.r
+    if problem.yields:
+        y += problem.compliance * result.impulse
     result.velocity = y if problem.units is None else problem.velocities_by(result.impulse)
     terms = problem.cones.de_saxce(y) if result.law == RELAXATION else np.zeros(0)
     result.states, here = states(result.impulse, y, problem.diagonal, problem.mu, terms)

@@ -17,6 +17,7 @@ and the conic method with shorter steps take turns, and at last there are cone p
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -56,9 +57,9 @@ class Auto:
 
     def iterations(self, problem: ConeProblem, tol: float, coulomb: bool, few: bool = False) -> int:
         """Those of APGD. Small problems have fixed costs; where they are ``few`` those of both methods are calls."""
-        per_digit = self.elimination if few else self.patience * np.cbrt(max(problem.size, 400))
+        per_digit = self.elimination if few else self.patience * max(problem.size, 400) ** (1.0 / 3.0)
         per_digit *= self.law if coulomb else 1.0
-        return broadcast(problem.comm, int(-np.log10(tol) * per_digit))
+        return broadcast(problem.comm, int(-math.log10(tol) * per_digit))
 
 
 def solve(

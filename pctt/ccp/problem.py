@@ -75,7 +75,7 @@ class ConeProblem:
     key : (nc,) persistent names of the contacts or None
     compliance : (nc, 3) the diagonal of C, (C_n, C_t, C_t) per contact (1/kg); given as C_n, a number or (nc,), or as
         (nc, 2)
-    yields : whether C is not zero, the same on all ranks
+    yields, all_yield : whether C is not zero, and whether no contact is rigid along its normal, the same on all ranks
     size : contacts on all ranks, Nc
     unanswered : contacts on all ranks that no impulse moves: N has zeros in their rows
     mean_diagonal : mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts
@@ -113,13 +113,14 @@ class ConeProblem:
         known = self.contact_map is not None and math.isfinite(trace)
         wrong = 0 if known else _not_finite(blocks)
         self.diagonal = _diagonals(blocks) + self.compliance
-        here = wrong, self.cones.count, *_rows_with(self.diagonal, self.compliance), self.r.size, trace
+        soft, rigid, unanswered = _rows_with(self.diagonal, self.compliance, self.cones.count)
+        here = wrong, self.cones.count, soft, rigid, unanswered, self.r.size, trace
         (*counts, trace), _ = reduced(comm, here, ())
-        wrong, self.size, soft, self.unanswered, rows = map(int, counts)
+        wrong, self.size, soft, rigid, self.unanswered, rows = map(int, counts)
         if wrong:
             self.destroy()
             raise ValueError(f"G has a NaN or an infinite number in {wrong} contacts")
-        self.yields = bool(soft)
+        self.yields, self.all_yield = bool(soft), soft > 0 and not rigid
         self.mean_diagonal = trace / rows if trace > 0.0 else 1.0
 
     def __repr__(self) -> str:
@@ -305,12 +306,6 @@ class ConeProblem:
         self._curvature.append(min(values[0] / max(abs(values[0]), abs(values[-1]), TINY), 0.0))
         return self._curvature[0]
 
-    @cached_property
-    def all_yield(self) -> bool:
-        """Whether all contacts have compliance; the same on all ranks."""
-        normal = self.compliance[: self.cones.count, 0]
-        return self.yields and self.min(normal.min(initial=np.inf)) > 0.0
-
     def by_rows(self) -> ConeProblem:
         """The same problem with the rows of its map as they are, if more than contacts couples its bodies; it shares
         all arrays, and has the same residuals. Collective."""
@@ -398,17 +393,19 @@ def _put_both_tangents(given: Array, out: Array) -> None:
 
 
 @loop
-def _rows_with(diagonal: Array, compliance: Array) -> tuple[int, int]:
-    """How many rows (n, 3) of C have compliance, and in how many the diagonal of N (n, 3) is zero."""
-    soft, unanswered = 0, 0
+def _rows_with(diagonal: Array, compliance: Array, contacts: int) -> tuple[int, int, int]:
+    """How many rows (n, 3) of C have compliance, how many of the first ones, of so many contacts, have none along the
+    normal, and in how many rows the diagonal of N (n, 3) is zero."""
+    soft, rigid, unanswered = 0, 0, 0
     for c in range(len(compliance)):
+        rigid += c < contacts and not compliance[c, 0] > 0.0
         gives = False
         answers = False
         for k in range(3):
             gives = gives or compliance[c, k] > 0.0
             answers = answers or diagonal[c, k] != 0.0
         soft, unanswered = soft + gives, unanswered + (not answers)
-    return soft, unanswered
+    return soft, rigid, unanswered
 
 
 def _number(x: float) -> float:

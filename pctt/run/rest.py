@@ -89,7 +89,9 @@ def _kinetic_part(world: World, system: ContactSystem) -> float:
     """The kinetic energy of the bodies over that which a step of free motion would give them; inf where a tool, a belt
     or a flow passes them faster than that. Collective."""
     grains, large = world.grains, world.large
-    own = [(grains, system.free_velocity), (large, system.free_large)][: 1 if world.comm.rank else 2]  # as in a record
+    own = [(grains, system.free_velocity)]
+    if world.large_moves and world.comm.rank == 0:  # as in a record
+        own.append((large, system.free_large))
     each = [energies_of_fall(of.quaternion, of.velocity, of.mass, of.inertia, free) for of, free in own]
     (kinetic, fall, mass), _ = reduced(world.comm, [*map(sum, zip(*each))], ())
     if kinetic >= SLOW * fall:  # so a bed that is stirred pays for two sums

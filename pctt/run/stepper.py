@@ -28,7 +28,6 @@ from dem.together import SceneError
 from dem.unconstrained import UnconstrainedMotion, unconstrained
 from pctt import ccp, log
 from pctt.arrays import Array
-from pctt.ccp.cones import Cones
 from pctt.options import OptionError
 from pctt.run import rest
 
@@ -282,10 +281,9 @@ def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
     G, point, key, soft = system.problem_map, system.point, system.key, system.compliance
     r: Array = system.r
-    cones: Cones = ccp.FrictionCones(system.mu)
-    if (resists := system.resistance) is not None:
-        r = np.concatenate([r, resists.velocity])
-        cones = ccp.RollingCones(system.mu, *resists.most)
+    if (resists := system.resistance) is None:
+        return ccp.ConeProblem(comm, r, system.mu, G=G, point=point, key=key, compliance=soft)
+    r, cones = np.concatenate([r, resists.velocity]), ccp.RollingCones(system.mu, *resists.most)
     return ccp.ConeProblem(comm, r, cones=cones, G=G, point=point, key=key, compliance=soft)
 
 

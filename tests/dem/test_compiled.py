@@ -10,10 +10,12 @@ import sys
 import textwrap
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from cases import random_quaternions
 from numba.core.caching import CompileResultCacheImpl
+from numba.core.typing.arraydecl import GetItemBuffer
 
 import dem
 import pctt
@@ -265,3 +267,18 @@ def test_places_of_keys_are_found_in_any_order(order):
     known = {key: place for place, key in enumerate(keys.tolist())}
     np.testing.assert_array_equal(places(keys, asked), [known.get(key, -1) for key in asked.tolist()])
     np.testing.assert_array_equal(places(asked[:0], keys), -1)
+
+
+def test_the_type_of_an_index_is_found_once(monkeypatch):
+    """numba would ask for it at each place in each loop."""
+    asked, find = [], GetItemBuffer.generic
+    monkeypatch.setattr(GetItemBuffer, "generic", lambda self, *given: asked.append(given) or find(self, *given))
+    loop(lambda x: x)(0)  # imports what remembers
+
+    @numba.njit
+    def trace(x, i):
+        return x[i, i, i, i] + x[i, i, i, i + 1] + x[i, i, i + 1, i]
+
+    x = np.arange(81, dtype=np.int16).reshape(3, 3, 3, 3)
+    assert [trace(x, 1), numba.njit(lambda x, i: x[i, i, i, i] - x[0, i, i, i])(x, 1)] == [40 + 41 + 43, 27]
+    assert len(asked) == 2  # of i, i, i, i and 0, i, i, i

@@ -14,13 +14,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dem.compiled import PART, inlined, loop, prange
+from dem.compiled import PART, inlined, inner, loop, prange
 from pctt.arrays import Array, tangential
 from pctt.ccp.cones.base import Cones, Units, floats
 
 _NONE = 1.0, np.empty((0, 3))
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
-STRIP = 256  # contacts whose numbers stay in the nearest cache from one loop to the next
+STRIP, PIECE = 256, 128  # contacts whose numbers stay in the nearest cache from one loop to the next; of their sums
 NO_MOVE = 64.0 * float(np.finfo(float).eps) ** 2  # (8 eps)^2: |move|^2 / |step y|^2 that rounding makes
 
 
@@ -48,6 +48,14 @@ def project_to(x: Array, mu: Array, out: Array) -> Array:
 
 
 @loop
+def _scaled(mu: Array, size: Array, out: Array) -> Array:
+    """The coefficients of unknowns multiplied by ``size`` (nc, 3), in the precision of ``out``."""
+    for c in range(len(mu)):
+        out[c] = mu[c] * size[c, 1] / size[c, 0]
+    return out
+
+
+@loop
 def active(x: Array, last_x: Array, y: Array, mu: Array, least: float) -> NDArray[np.bool_]:
     """The loop of `FrictionCones.active`."""
     out, enough = np.empty(len(mu), np.bool_), x.dtype.type(least)
@@ -70,8 +78,9 @@ def errors(
     closing work, opening work and 1/2 x.(y - r).
 
     With the sizes (nc, 3) of the unknowns, if there are any, x and y have the units unit / size and unit size."""
-    sums, most = np.zeros((5, STRIP)), np.zeros(STRIP)
-    g, v, scaled = np.empty(3 * STRIP), np.empty(3 * STRIP), len(size) > 0
+    room = _room(len(mu), STRIP)
+    sums, most = np.zeros((5, room)), np.zeros(room)
+    g, v, scaled = np.empty(3 * room), np.empty(3 * room), len(size) > 0
     x, y, r, size = x.ravel(), y.ravel(), r.ravel(), size.ravel()
     for first in range(0, len(mu), STRIP):
         friction = mu[first : first + STRIP]
@@ -83,31 +92,37 @@ def errors(
         _add_moves(g, v, step, friction, de_saxce, sums[0])
         _add_works(g, v, r[a:b], len(friction), sums[1], sums[2], sums[3], sums[4], most)
     greatest = 0.0
-    for k in range(STRIP):
+    for k in range(room):
         greatest = most[k] if most[k] > greatest or most[k] != most[k] else greatest
     return (_sum(sums[0]), _sum(sums[1]), _sum(sums[2]), _sum(sums[3]), _sum(sums[4])), greatest
 
 
-@loop
+@inlined
+def _room(count, most):
+    """The whole pieces that hold so many numbers, or the `most`: of few contacts no zeros are added up."""
+    return min(most, (count + PIECE - 1) // PIECE * PIECE)
+
+
+@inner
 def _sum(x):
-    """The sum of STRIP numbers, of eight side by side in each half."""
-    total, half = 0.0, STRIP // 2
-    for first in range(0, STRIP, half):
+    """The sum of numbers, of eight side by side in each of their pieces."""
+    total = 0.0
+    for first in range(0, len(x), PIECE):
         s = x[first : first + 8].copy()
-        for a in range(first + 8, first + half, 8):
+        for a in range(first + 8, first + PIECE, 8):
             for k in range(8):
                 s[k] += x[a + k]
         total += ((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7]))
     return total
 
 
-@loop
+@inner
 def _in_units(x, y, unit, size, g, v):
     for k in range(len(x)):
         g[k], v[k] = x[k] * (unit / size[k]), y[k] * (unit * size[k])
 
 
-@loop
+@inner
 def _add_moves(x, y, step, mu, de_saxce, squares):
     """Comparisons, here and below, let a NaN through."""
     for c in range(len(mu)):
@@ -119,7 +134,7 @@ def _add_moves(x, y, step, mu, de_saxce, squares):
         squares[c] += 0.0 if square <= NO_MOVE * (step * step) * (y_n * y_n + y_u * y_u + y_v * y_v) else square
 
 
-@loop
+@inner
 def _add_works(x, y, r, count, squares, closings, openings, energies, most):
     """In a loop of its own: a compiler makes vectors of two short loops, and not of a long one."""
     for c in range(count):
@@ -147,11 +162,10 @@ def accelerated_step(
     y_z are nowhere stored. A contact moves 64 bytes in single precision, 52 without compliance."""
     part, step_length, soft, count = x.dtype.type(beta), x.dtype.type(step), len(compliance) > 0, len(mu)
     x, last_x, y, compliance, to = x.ravel(), last_x.ravel(), y.ravel(), compliance.ravel(), out.reshape(out.size)
-    sums = np.zeros(((count + PART - 1) // PART, 3))
+    sums, room = np.zeros(((count + PART - 1) // PART, 3)), _room(3 * count, 3 * STRIP)
     for k in prange(len(sums)):
-        z, y_z = np.empty(3 * STRIP, x.dtype), np.empty(3 * STRIP, x.dtype)
-        squares, products = np.zeros(3 * STRIP, x.dtype), np.zeros(3 * STRIP, x.dtype)
-        work = np.zeros(3 * STRIP, x.dtype)
+        z, y_z, squares = np.empty(room, x.dtype), np.empty(room, x.dtype), np.zeros(room, x.dtype)
+        products, work = np.zeros(room, x.dtype), np.zeros(room, x.dtype)
         for first in range(k * PART, min(k * PART + PART, count), STRIP):
             friction = mu[first : first + STRIP]
             a, b = 3 * first, 3 * (first + len(friction))
@@ -174,32 +188,32 @@ def accelerated_step(
     return total_work, square, product
 
 
-@loop
+@inner
 def extrapolate(x, last_x, beta, out):
     for k in range(len(x)):
         out[k] = x[k] + beta * (x[k] - last_x[k])
 
 
-@loop
+@inner
 def add_compliance(y, compliance, z, out):
     for k in range(len(y)):
         out[k] = y[k] + compliance[k] * z[k]
 
 
-@loop
+@inner
 def add_work(x, y, compliance, sums):
     for k in range(len(x)):
         sums[k] += compliance[k] * (x[k] - y[k]) ** 2
 
 
-@loop
+@inner
 def _add_de_saxce(y, mu):
     for c in range(len(mu)):
         i = 3 * c
         y[i] += mu[c] * np.sqrt(y[i + 1] * y[i + 1] + y[i + 2] * y[i + 2])
 
 
-@loop
+@inner
 def _step(x, y, step, mu, out):
     for c in range(len(mu)):
         i = 3 * c
@@ -207,13 +221,13 @@ def _step(x, y, step, mu, out):
         out[i], out[i + 1], out[i + 2] = _nearest(n, t_1, t_2, mu[c])
 
 
-@loop
+@inner
 def add_squares(x, y, sums):
     for k in range(len(x)):
         sums[k] += (x[k] - y[k]) ** 2
 
 
-@loop
+@inner
 def add_products(x, y, z, sums):
     for k in range(len(x)):
         sums[k] += (x[k] - y[k]) * z[k]
@@ -301,7 +315,7 @@ class FrictionCones(Cones):
         return times(blocks, x)
 
     def scaled(self, size: Array, precision: type[np.floating]) -> FrictionCones:
-        return FrictionCones((self.mu * size[:, 1] / size[:, 0]).astype(precision, copy=False))
+        return FrictionCones(_scaled(self.mu, size, np.empty(self.count, precision)))
 
     def only(self, contacts: NDArray[np.intp]) -> FrictionCones:
         return FrictionCones(self.mu[contacts])

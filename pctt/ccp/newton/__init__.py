@@ -116,7 +116,7 @@ class Newton:
 
     def may_eliminate(self, problem: ConeProblem) -> bool:
         """Whether an order of elimination is looked for at all."""
-        return self.own and has_few(problem)
+        return has_few(problem) and self.own
 
     def has_elimination(self, problem: ConeProblem) -> bool:
         """Whether the systems of this problem are solved by elimination."""
