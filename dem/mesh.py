@@ -130,21 +130,22 @@ class Surface:
             return np.arange(len(self.vertex))
 
     def near(self, points: Floats, reach: Floats) -> tuple[Ints, Ints]:
-        """Pairs (rows of points, triangles): all triangles within reach (n,) [m] of points (n, 3), and some more."""
-        found = [(np.zeros(0, np.int64), np.zeros(0, np.int64))]
+        """Pairs (rows of points, triangles), by rows; at least all triangles within reach (n,) [m] of points (n, 3)."""
         level = np.frexp(reach)[1]
-        for k in np.unique(level):
-            cells, at_level = self._table(int(k)), np.flatnonzero(level == k)
-            place = np.floor((points[at_level] - cells.low) / cells.width)
-            inside = ((place >= 0.0) & (place < _CODE[1])).all(axis=1)
-            code = np.where(inside[:, None], place, 0.0).astype(np.int64) @ _CODE
-            at = np.minimum(np.searchsorted(cells.code, code), len(cells.code) - 1)
-            hit = np.flatnonzero(inside & (cells.code[at] == code))
-            row, entry = spread(cells.start, at[hit])
-            found.append((at_level[hit[row]], cells.triangle[entry]))
-        row, triangle = (np.concatenate(parts) for parts in zip(*found))
-        close = self._within(points[row], triangle, reach[row] * (1.0 + 1e-9))
+        found = [self._at_level(points, int(k), (level == k).nonzero()[0]) for k in np.unique(level)]
+        row, triangle = found[0] if found else (np.zeros(0, np.int64),) * 2
+        if len(found) > 1:
+            row, triangle = map(np.concatenate, zip(*found))
+            order = np.argsort(row, kind="stable")
+            row, triangle = row[order], triangle[order]
+        close = self._within(points, row, triangle, reach * (1.0 + 1e-9))
         return row[close], triangle[close]
+
+    def _at_level(self, points: Floats, level: int, rows: Ints) -> tuple[Ints, Ints]:
+        """Pairs (rows of points, triangles) of the cubes in which these rows of points are."""
+        cells = self._table(level)
+        row, entry = _entries(points, rows, cells.low, cells.width, cells.code, cells.start)
+        return row, cells.triangle[entry]
 
     def over(self, points: Floats, triangle: Ints) -> Floats:
         """How far points (m, 3) are inside the three sides (m, 3) of triangles (m,), seen along the normals [m]."""
@@ -155,20 +156,20 @@ class Surface:
         inside = np.einsum("mki,mki->mk", points[:, None] - corner, inward)
         return np.where(size > 0.0, inside / np.where(size > 0.0, size, 1.0), -np.inf)  # type: ignore[no-any-return]
 
-    def _within(self, points: Floats, triangle: Ints, reach: Floats) -> Ints:
-        """Which of triangles (m,) may be within reach (m,) [m] of points (m, 3), by the spheres about them and then by
-        their planes."""
-        away = points - self._center[triangle]
-        close = np.flatnonzero(np.einsum("ij,ij->i", away, away) <= (reach + self._radius[triangle]) ** 2)
-        height = np.einsum("ij,ij->i", away[close], self.normal[triangle[close]])
-        return close[np.abs(height) <= reach[close]]
+    def _within(self, points: Floats, row: Ints, triangle: Ints, reach: Floats) -> Ints:
+        """Which of triangles (m,) may be within reach (n,) [m] of points (n, 3), these rows (m,) of them, by the
+        spheres about the triangles and then by their planes."""
+        return _may_reach(points, row, triangle, reach, self._center, self._radius, self.normal)
+
+    @cached_property
+    def _rims(self) -> tuple[Ints, Ints]:
+        """The features (m, 3) of the sides of triangles, and of their corners."""
+        edges, vertices = len(self.triangle), len(self.triangle) + len(self.edge)
+        return edges + self.side, vertices + self.triangle
 
     def closest(self, points: Floats, triangle: Ints) -> Closest:
         """The points of triangles (m,) that are closest to points (m, 3): over the face, or else of the three edges."""
-        edges, vertices = len(self.triangle), len(self.triangle) + len(self.edge)
-        return Closest(
-            *_closest(points, triangle, self.corner, self.normal, edges + self.side, vertices + self.triangle)
-        )
+        return Closest(*_closest(points, triangle, self.corner, self.normal, *self._rims))
 
     def _table(self, level: int) -> Cells:
         """The cells for reaches up to 2^level [m]: halved, with the triangles that come near, until they are half as
@@ -186,7 +187,7 @@ class Surface:
             triangle = np.repeat(triangle, 8)
             far = 0.5 * np.sqrt(3.0) * width + reach * (1.0 + 1e-9)
             middle = low + (place + 0.5) * width
-            close = self._within(middle, triangle, np.full(len(triangle), far))
+            close = self._within(middle, np.arange(len(triangle)), triangle, np.full(len(triangle), far))
             close = close[self.closest(middle[close], triangle[close]).distance <= far]
             place, triangle = place[close], triangle[close]
         codes = place @ _CODE
@@ -227,8 +228,50 @@ def _closest(points, triangle, corner, normal, edge, vertex):
     return point, feature, distance
 
 
-#: One number for the integer coordinates of a cube: more than any side of a neighbourhood has.
-_CODE = np.array([1 << 40, 1 << 20, 1])
+@loop
+def _may_reach(points, row, triangle, reach, center, radius, normal):
+    """The loop of `Surface._within`."""
+    close, found = np.empty(len(row), np.int64), 0
+    for n in range(len(row)):
+        p, t = row[n], triangle[n]
+        x, y, z = points[p, 0] - center[t, 0], points[p, 1] - center[t, 1], points[p, 2] - center[t, 2]
+        height = abs(x * normal[t, 0] + y * normal[t, 1] + z * normal[t, 2])
+        if height <= reach[p] and x * x + y * y + z * z <= (reach[p] + radius[t]) ** 2:
+            close[found] = n
+            found += 1
+    return close[:found]
+
+
+@loop
+def _entries(points, rows, low, width, code, start):
+    """Pairs (m,) of the points of these rows, and of the entries of the cube that they are in."""
+    at, count = np.full(len(rows), -1), 0
+    for n in range(len(rows)):
+        number, inside = 0, True
+        for k in range(3):
+            place = np.floor((points[rows[n], k] - low[k]) / width)
+            inside &= (place >= 0.0) & (place < SIDE)
+            number = number * SIDE + int(place if inside else 0.0)
+        first, last = 0, len(code) - 1 if inside else -1
+        while first < last:
+            middle = (first + last) // 2
+            first, last = (middle + 1, last) if code[middle] < number else (first, middle)
+        if first == last and code[first] == number:
+            at[n] = first
+            count += start[first + 1] - start[first]
+    row, entry, found = np.empty(count, np.int64), np.empty(count, np.int64), 0
+    for n in range(len(rows)):
+        if at[n] >= 0:
+            for e in range(start[at[n]], start[at[n] + 1]):
+                row[found], entry[found] = rows[n], e
+                found += 1
+    return row, entry
+
+
+SIDE = 1 << 20  # more cubes than any side of a neighbourhood has
+
+#: One number for the integer coordinates of a cube.
+_CODE = np.array([SIDE * SIDE, SIDE, 1])
 
 
 def spread(start: Ints, of: Ints) -> tuple[Ints, Ints]:

@@ -25,6 +25,10 @@ and the place goes along the face as it rolls on them: with the normal of the en
 take energy from a plank that rocks on a log, to first order. What rests on round grains keeps that of the end, which
 damps it.
 
+What touches bodies at rest has the normal of the start as well, with the gap of the end. So the force is along the
+normal at the place between two velocities, as in the method SHAKE (Ryckaert, Ciccotti, Berendsen, J. Comput. Phys. 23,
+1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge, without loss.
+
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
 there then goes with the host (`seen_from`, `turn_ahead`).
@@ -48,6 +52,15 @@ FURTHEST = 0.25
 #: Half thicknesses of a guest by which a linear gap may overlap before the overlap at the start is looked up.
 DEEP = 0.005
 
+#: Half thicknesses of a guest within which a contact of the end is one of the start: it goes FURTHEST, on a hollow
+#: surface the contact further.
+NEAREST = 0.5
+
+#: Half thicknesses of a guest up to which a contact touches: one that comes to an edge would be held by that.
+CLOSE = 1e-4
+
+LEAST_COSINE = 0.9  #: of the angle by which the normal of a contact may turn until the end
+
 #: Of spheres, boxes, -, capsules, half spaces, meshes, polyhedra, other convex bodies: of a pair the one of lower rank
 #: is the guest.
 RANK = np.array([0, 3, 9, 1, 5, 6, 4, 2])
@@ -67,7 +80,8 @@ class Course(NamedTuple):
 
 Moving = tuple[Floats, Floats, Bools, float]  #: a `Course`
 Paired = tuple[Ints, Ints, Ints, Floats]  #: of pairs rows of shapes (m,), of contacts the pair (nc,), the reach (m,)
-Touching = tuple[Floats, Floats, Floats, Bools]  #: a `Touch`, and which are of `dem.contact.primitives.on_faces`
+Touched = tuple[Floats, Floats, Floats]  #: a `Touch`
+Touching = tuple[Floats, Floats, Floats, Floats]  #: a `Touch`, and normals of `dem.contact.primitives.lasting`
 
 
 @inlined
@@ -116,7 +130,7 @@ def turn_ahead(
 
     `arcs` (nc, 4, 3) are as of `dem.contact.convex.arcs_of`; empty without such shapes."""
     (kind, row, size, _), (center, quaternion) = forms, poses
-    (place, velocity, moves, dt), (i, j, pair, reach), (point, normal, gap, on_face) = course, pairs, touch
+    (place, velocity, moves, dt), (i, j, pair, reach), (point, normal, gap, lasting) = course, pairs, touch
     moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
     deep, found, wide = np.empty(len(pair), np.int64), 0, 0
     for c in range(len(pair)):
@@ -145,9 +159,17 @@ def turn_ahead(
             middle, after = after_turn(plus(point[c], -1.0, place[B]), w, h), gap[c]
             own = plus(plus(plus(middle, -0.5 * after, n), -1.0, apart), h, plus(W, -1.0, V))
             their = plus(middle, 0.5 * after, n)
+        start = of_start(lasting, c, sign)
+        rests = _rests(moves[A], V, u) or _rests(moves[B], W, w)
+        if here and rests and gap[c] <= CLOSE * core:
+            start = sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]
+        lasts = dot(start, start) > 0.0
+        if not lasts:
+            start = n
         # From what turns with the bodies to their surfaces, at the end and at the start.
         arc, bow = (core * n[0], core * n[1], core * n[2]), (-under * n[0], -under * n[1], -under * n[2])
-        first_arc, first_bow = arc, bow
+        first_arc = core * start[0], core * start[1], core * start[2]
+        first_bow = -under * start[0], -under * start[1], -under * start[2]
         if kind[a] >= CONVEX:
             arc, first_arc = vector_of(arcs[c, 0], 0), vector_of(arcs[c, 1], 0)
         if kind[b] >= CONVEX:
@@ -157,12 +179,10 @@ def turn_ahead(
             inside = after_turn(plus(own, -1.0, arc), u, -h)
         if h == 0.0 or dot(n, n) == 0.0:
             continue
-        rolls = on_face[c] and flat and dot(arc, arc) > 0.0
-        if rolls:
-            n = after_turn(n, w, -h)
-            first_arc = vector_of(arcs[c, 1], 0) if kind[a] >= CONVEX else (core * n[0], core * n[1], core * n[2])
+        lasts &= rests or (flat and dot(arc, arc) > 0.0)
+        n = start if lasts else n
         below = plus(center[b], -1.0, place[B]) if kind[b] == SPHERE else after_turn(plus(their, -1.0, bow), w, -h)
-        if moves[A] or rolls:
+        if moves[A] or lasts:
             own = plus(inside, 1.0, first_arc)
             if flat:
                 below = plus(own, 1.0, apart)  # the two arms lead to one place
@@ -170,7 +190,7 @@ def turn_ahead(
             their = plus(below, 1.0, first_bow)
         linear[c] = after - h * dot(n, plus(plus(W, 1.0, cross(w, their)), -1.0, plus(V, 1.0, cross(u, own))))
         half = 0.5 * min(gap[c] if here else linear[c], 0.0)
-        if (moves[A] or rolls) and flat:
+        if (moves[A] or lasts) and flat:
             below = plus(below, linear[c], n)
             their = below if moves[B] else their
         more = plus(_bend(below, w, dt), -1.0, _bend(inside, u, dt))
@@ -196,6 +216,45 @@ def turn_ahead(
     for c in range(len(pair)):
         wide += gap[c] > reach[pair[c]]
     return moved, swing, linear, deep[:found], wide
+
+
+@inlined
+def of_start(lasting, c, sign):
+    """The normal of the start that the contact c keeps, sign times it; zero where it does not, or none does."""
+    if not len(lasting):
+        return 0.0, 0.0, 0.0
+    return sign * lasting[c, 0], sign * lasting[c, 1], sign * lasting[c, 2]
+
+
+@inlined
+def _rests(moves, velocity, spin):
+    """Whether a body is at rest, and impulses do not move it."""
+    return (not moves) and dot(velocity, velocity) + dot(spin, spin) == 0.0
+
+
+@loop
+def nearest_normals(
+    forms: Forms, inner: Floats, guest: Ints, pair: Ints, touch: Touched, now_pair: Ints, now: Touched
+) -> Floats:
+    """Return for contacts (k,) of guests in these rows the normals (k, 3) that they have now: of the contacts now (l,)
+    of the same pair that touch, at most NEAREST half thicknesses of the guest away, that of nearly the same direction;
+    their own where there is none."""
+    (kind, _, size, _), (point, normal, _), (now_point, now_normal, now_gap) = forms, touch, now
+    out, last, before = normal.copy(), np.full(pair.max() + 1, -1), np.empty(len(now_pair), np.int64)
+    for n in range(len(now_pair)):
+        before[n], last[now_pair[n]] = last[now_pair[n]], n
+    for c in range(len(pair)):
+        thick, best, n = _thickness(kind[guest[c]], size[guest[c]], inner), LEAST_COSINE, last[pair[c]]
+        while n >= 0:
+            square, cosine = 0.0, 0.0
+            for k in range(3):
+                square += (now_point[n, k] - point[c, k]) ** 2
+                cosine += now_normal[n, k] * normal[c, k]
+            if cosine > best and square < (NEAREST * thick) ** 2 and now_gap[n] <= CLOSE * thick:
+                best = cosine
+                out[c] = now_normal[n]
+            n = before[n]
+    return out
 
 
 @inlined

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
+from dem.compiled import loop
 from dem.contact.narrow import (
     Capsules,
     Manifold,
@@ -112,18 +113,48 @@ def _feet(ball: Spheres, delta: Floats, surface: Surface) -> SurfaceContacts:
     center, radius = ball
     row, triangle = surface.near(center, radius + delta)
     found = surface.closest(center[row], triangle)
-    close = np.flatnonzero(found.distance <= (radius + delta)[row])
-    row, triangle = row[close], triangle[close]
-    found = Closest(found.point[close], found.feature[close], found.distance[close])
-    _, first = np.unique(row * surface.features + found.feature, return_index=True)  # triangles share edges, vertices
-    size = found.distance[first, None]
-    away = (center[row[first]] - found.point[first]) / np.where(size > 0.0, size, 1.0)  # zero where there is no way
-    within = within_cone(surface, found.feature[first], found.point[first], away, ROUNDING)
-    away = np.where(size > 0.0, away, surface.normal[triangle[first]])
-    least, away = first[within], away[within]
+    corners = surface.vertex, *surface.around
+    least, away = _least_around(center, radius + delta, row, triangle, found[:], surface.normal, corners)
     chosen = _one_for_each(row, triangle, found, least, radius, surface)
     row, gap = row[least], found.distance[least] - radius[row[least]]
     return SurfaceContacts(row, found.feature[least], found.point[least], away, gap).take(chosen)
+
+
+@loop
+def _least_around(center, reach, row, triangle, found, normal, corners):
+    """Of the closest points of triangles (m,) to the centres of these rows (m,) of balls those (k,) that are within
+    reach, and least around them: one for each ball and feature, in their order; and the directions (k, 3) from there to
+    the centres."""
+    (point, feature, distance), (vertex, start, other), faces = found, corners, len(normal)
+    least, away, count, first = np.empty(len(row), np.int64), np.empty((len(row), 3)), 0, 0
+    for n in range(len(row)):
+        if n and row[n] != row[n - 1]:
+            first = count
+        size = distance[n]
+        if not size <= reach[row[n]]:
+            continue
+        at = count
+        while at > first and feature[least[at - 1]] > feature[n]:
+            at -= 1
+        if at > first and feature[least[at - 1]] == feature[n]:
+            continue  # triangles share edges and vertices
+        x, y, z = normal[triangle[n], 0], normal[triangle[n], 1], normal[triangle[n], 2]
+        if size > 0.0:
+            x, y, z = center[row[n], 0] - point[n, 0], center[row[n], 1] - point[n, 1], center[row[n], 2] - point[n, 2]
+            x, y, z = x / size, y / size, z / size
+        inside, rim = True, feature[n] - faces
+        if rim >= 0 and size > 0.0:
+            for e in range(start[rim], start[rim + 1]):
+                o = other[e]
+                u, v, w = vertex[o, 0] - point[n, 0], vertex[o, 1] - point[n, 1], vertex[o, 2] - point[n, 2]
+                inside &= not (u * x + v * y + w * z > ROUNDING * np.sqrt(u * u + v * v + w * w))
+        if not inside:
+            continue
+        for k in range(count, at, -1):
+            least[k], away[k] = least[k - 1], away[k - 1]
+        least[at], away[at, 0], away[at, 1], away[at, 2] = n, x, y, z
+        count += 1
+    return least[:count], away[:count]
 
 
 def within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, slack: float) -> Bools:

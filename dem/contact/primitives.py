@@ -12,7 +12,7 @@ from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
 from dem.compiled import inlined, loop
-from dem.contact.ahead import Course, Forms, Poses, guest_is_second, seen_from, turn_ahead, vector_of
+from dem.contact.ahead import Course, Forms, Poses, guest_is_second, nearest_normals, seen_from, turn_ahead, vector_of
 from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.convex import (
     Solids,
@@ -77,7 +77,7 @@ class Primitives(NamedTuple):
     hulls: Hulls  #: of boxes and of the polyhedra of the scene
     supports: Supports  #: of its other convex shapes
     curved: bool  #: whether any shape is one of `dem.shapes.CONVEX_SHAPES`
-    rolls: bool  #: whether a part of a large body is a sphere, a capsule or one of these
+    bounded: bool  #: whether a part of a large body is no half space
     members: Members | None = None  #: the spheres of clumps; None in scenes without
 
     def moved(self, rows: Ints, center: Floats, turn: Floats) -> Primitives:
@@ -175,7 +175,7 @@ def primitives(
         hulls=hulls,
         supports=supports_of(forms),
         curved=bool((both["kind"] >= CONVEX).any()),
-        rolls=bool(is_round(columns["kind"][1]).any()),
+        bounded=bool((columns["kind"][1] != PLANE).any()),
         members=members(table.take(slice(0, count)), forms, after),
     )
 
@@ -236,7 +236,7 @@ def touches_ahead(
     rows of bodies, so many, are `grains`. A deep gap is no deeper than the pair overlaps at the start, and none is
     wider than `delta` there."""
     found = touches(table, i, j, delta, course)
-    touch = (*found.touch, on_faces(table, i, j, found, course.moves, grains))
+    touch = (*found.touch, lasting(table, i, j, delta, found, course, grains))
     given = *table.tables(), course[:], (i, j, found.pair, delta), touch
     arcs = arcs_of(*given, table.supports[:]) if table.curved else np.zeros((0, 4, 3))
     moved, swing, linear, deep, wider = turn_ahead(*given, arcs)
@@ -252,22 +252,46 @@ def touches_ahead(
     return found, moved, swing, linear
 
 
-def on_faces(table: Primitives, i: Ints, j: Ints, found: Manifold, moves: Bools, grains: int) -> Bools:
-    """Which contacts (nc,) of pairs of rows i, j (m,) are of round guests on flat faces of hosts that impulses move, by
-    the rows of bodies `moves`. Grains are no guests: what rests on a bed of them would tremble."""
-    kind, flat = table.kind, np.zeros(len(found.pair), np.bool_)
-    if not table.rolls:
-        return flat
-    guests = is_round(kind) & (table.row >= grains)
+def lasting(
+    table: Primitives, i: Ints, j: Ints, delta: Floats, found: Manifold, course: Course, grains: int
+) -> Floats:
+    """The normals (nc, 3) of the start of the step for contacts of pairs of rows i, j (m,) that keep them, for others
+    zeros; no row if none does. They are kept by round guests on flat faces of hosts that impulses move, and on bodies
+    at rest. The first rows of bodies, so many, are `grains`: these are no guests on faces, as what rests on a bed of
+    them would tremble. Those of contacts that are found where bodies are `turn_ahead` knows."""
+    if not table.bounded:
+        return np.zeros((0, 3))
+    kind, normal, part = table.kind, np.zeros((len(found.pair), 3)), table.row >= grains
     guest, host, swap = guests_and_hosts(kind, i, j, found.pair)
-    faces = moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)
-    rows = np.flatnonzero(faces[host] & guests[guest])
-    away = found.touch.normal * np.where(swap, 1.0, -1.0)[:, None]
-    flat[rows[kind[host[rows]] == PLANE]] = True
+    rests, ahead = _at_rest(table, course, part), (kind != SPHERE) & (kind != BOX)
+    if len(kept := np.flatnonzero((rests[guest] | rests[host]) & ((kind[guest] != SPHERE) | ahead[host]))):
+        pairs, row = np.unique(found.pair[kept], return_inverse=True)
+        now = touches(table, i[pairs], j[pairs], delta[pairs])
+        of_pairs = table.tables()[0], table.hulls.inner, guest[kept]
+        normal[kept] = nearest_normals(*of_pairs, row, found.touch.take(kept)[:], now.pair, now.touch[:])
+    faces = course.moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)
+    rows = np.flatnonzero(faces[host] & (part & is_round(kind))[guest])
+    if len(rows):
+        flat = rows[_on_faces(table, found, rows, host[rows], np.where(swap[rows], 1.0, -1.0)[:, None])]
+        normal[flat] = found.touch.normal[flat]
+    return normal
+
+
+def _at_rest(table: Primitives, course: Course, part: Bools) -> Bools:
+    """Which shapes (n,) but half spaces, which are flat, are parts of bodies at rest that impulses do not move."""
+    rests: Bools = part & (table.kind != PLANE) & ~course.moves[table.row]
+    rests[rests] = (course.velocity[table.row[rests]] == 0.0).all(axis=1)
+    return rests
+
+
+def _on_faces(table: Primitives, found: Manifold, rows: Ints, host: Ints, sign: Floats) -> Bools:
+    """Which of these contacts touch flat faces of their hosts, all (rows,)."""
+    kind, away = table.kind[host], found.touch.normal[rows] * sign
+    flat = kind == PLANE
     for row in table.surfaces:
-        mesh, own = table.mesh(row), rows[host[rows] == row]
-        flat[own] = flat_across(mesh.surface, found.feature[own], away[own] @ mesh.turn)
-    own = rows[(kind[host[rows]] != PLANE) & (kind[host[rows]] != MESH)]
+        mesh, own = table.mesh(row), host == row
+        flat[own] = flat_across(mesh.surface, found.feature[rows[own]], away[own] @ mesh.turn)
+    own = (kind != PLANE) & (kind != MESH)
     flat[own] = flat_towards(table.solid(host[own]), away[own], table.hulls)
     return flat
 
