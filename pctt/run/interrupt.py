@@ -11,7 +11,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from types import FrameType
 
 from mpi4py import MPI
@@ -21,8 +20,6 @@ from mpi4py import MPI
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP, signal.SIGXCPU)
 
 _noted: list[int] = []
-
-_signal = import_module("_signal")  #: beneath `signal`, which makes enums of all that it returns: of every step a 50th
 
 
 class InterruptError(RuntimeError):
@@ -54,15 +51,15 @@ def is_requested(comm: MPI.Comm) -> bool:
 def uninterrupted() -> Iterator[None]:
     """A block, or a function, in which Ctrl-C waits until its end: files and states are whole then, and no library is
     left amid a call. For scripts and notebooks; the program notes signals by itself."""
-    mine = _signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    mine = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not mine or threading.current_thread() is not threading.main_thread():
         yield
         return
     asked: list[int] = []
-    _signal.signal(signal.SIGINT, lambda number, frame: asked.append(number))
+    signal.signal(signal.SIGINT, lambda number, frame: asked.append(number))
     try:
         yield
     finally:
-        _signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if asked:
         raise KeyboardInterrupt
