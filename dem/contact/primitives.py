@@ -259,18 +259,22 @@ def lasting(
     zeros; no row if none does. They are kept by round guests on flat faces of hosts that impulses move, and on bodies
     at rest. The first rows of bodies, so many, are `grains`: these are no guests on faces, as what rests on a bed of
     them would tremble. Those of contacts that are found where bodies are `turn_ahead` knows."""
+    none = np.zeros((0, 3))
     if not table.bounded:
-        return np.zeros((0, 3))
-    kind, normal, part = table.kind, np.zeros((len(found.pair), 3)), table.row >= grains
+        return none
+    kind, part = table.kind, table.row >= grains
+    rests, rolls = _at_rest(table, course, part), part & is_round(kind)
+    if not (rests.any() or rolls.any()):
+        return none
     guest, host, swap = guests_and_hosts(kind, i, j, found.pair)
-    rests, ahead = _at_rest(table, course, part), (kind != SPHERE) & (kind != BOX)
+    normal, ahead = np.zeros((len(found.pair), 3)), (kind != SPHERE) & (kind != BOX)
     if len(kept := np.flatnonzero((rests[guest] | rests[host]) & ((kind[guest] != SPHERE) | ahead[host]))):
         pairs, row = np.unique(found.pair[kept], return_inverse=True)
         now = touches(table, i[pairs], j[pairs], delta[pairs])
         of_pairs = table.tables()[0], table.hulls.inner, guest[kept]
         normal[kept] = nearest_normals(*of_pairs, row, found.touch.take(kept)[:], now.pair, now.touch[:])
     faces = course.moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)
-    rows = np.flatnonzero(faces[host] & (part & is_round(kind))[guest])
+    rows = np.flatnonzero(faces[host] & rolls[guest])
     if len(rows):
         flat = rows[_on_faces(table, found, rows, host[rows], np.where(swap[rows], 1.0, -1.0)[:, None])]
         normal[flat] = found.touch.normal[flat]
