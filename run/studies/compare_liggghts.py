@@ -497,8 +497,7 @@ LIGGGHTS has k = 1e8 N/m; ours are the defaults with `apgd`. n = 32 has 274,625 
 
 {table}
 
-LIGGGHTS gains more by the second rank than ours does. At n = 4 a second rank makes ours slower. 0.05 s are few of our
-steps, and the first ones after a start take more iterations than later ones.
+At n = 4 a second rank makes ours slower. 0.05 s are few of our steps, and the first ones take more iterations.
 
 """
 

@@ -154,7 +154,7 @@ FEATURES = {
     partial(bed, grains="polyhedra"), ("dem/shapes/polyhedra.py",)),
     "periodic": Feature("two periods for four walls", bed, partial(bed, walls=False),
     ("dem/parts/cell.py", "dem/model/images.py")),
-    "shear": Feature("a cell of given stress that is sheared", partial(flow, at_rest=True), flow),
+    "shear": Feature("a flow in a cell of given stress, for one at rest", partial(flow, at_rest=True), flow),
     "servo": Feature("a sheared cell of given stress, for one of given size", partial(flow, constant=True), flow,
     ("dem/step/servo.py",)),
     **law("rolling", "resistance to rolling and spinning", "laws/rolling.py", "dem/step/resistance.py",
