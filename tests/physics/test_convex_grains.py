@@ -188,13 +188,14 @@ def test_ranks_agree():
 @pytest.mark.slow
 def test_a_bed_of_all_shapes_settles():
     with pctt.Simulation(bed(4, 6), dt=2.5e-3, tol=1e-6) as sim:
-        energy, kinetic = [], []
-        for _ in range(650):
+        energy, kinetic, springs = [], [], []
+        for _ in range(900):  # without resistance to rolling some rock for long
             row = sim.step()
             kinetic.append(row["kinetic_energy [J]"])
             energy.append(kinetic[-1] + row["potential_energy [J]"])
+            springs.append(row["spring_energy_before [J]"])
             assert overlap(sim) <= 3.0 * sim.expected_overlap  # 2.0 where this was written
             assert row["energy_jump"] == 0.0
-        assert (np.diff(energy) <= 1e-6 * energy[0]).all()
+        assert (np.diff(energy) <= np.array(springs[1:]) + 1e-6 * energy[0]).all()  # they give back what they have
         assert kinetic[-1] < 1e-3 * max(kinetic)
         assert sim.positions[:, 2].min() > 0.04
