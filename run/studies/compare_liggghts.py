@@ -482,7 +482,7 @@ liggghts`) is a soft-sphere code; both codes stir the same settled beds, on one 
 - Positions of the starts differ by 1e-5 m. Seconds are without start-up (median), overlaps the largest in % of a
   radius, torques means after 0.1 s, and the floor bears this part of the weight.
 - LIGGGHTS does better in three ways: there is no tolerance to choose; at n = 16 it costs no more per grain than at
-  n = 8, where our iterations grow; and its memory is a fifth to a seventh of ours, most of which is Python, PETSc and
+  n = 8, where our iterations grow; and its memory is a fifth of ours, most of which is Python, PETSc and
   compiled loops.
 
 ![How far the torque is off its limit, over CPU seconds per simulated second; letters are the lines](liggghts.png)
