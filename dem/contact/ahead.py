@@ -57,7 +57,7 @@ DEEP = 0.005
 NEAREST = 0.5
 
 #: Half thicknesses of a guest up to which a contact touches: one that comes to an edge would be held by that.
-CLOSE = 1e-4
+CLOSE = 5e-5
 
 LEAST_COSINE = 0.9  #: of the angle by which the normal of a contact may turn until the end
 
