@@ -21,6 +21,11 @@ from dem.compiled import loop
 from dem.geometry import obj, stl
 from dem.quaternion import cross, length
 
+SIDE = 1 << 20  # more cubes than any side of a neighbourhood has
+
+#: One number for the integer coordinates of a cube.
+_CODE = np.array([SIDE * SIDE, SIDE, 1])
+
 
 class Closest(NamedTuple):
     """Where triangles are closest to points."""
@@ -266,12 +271,6 @@ def _entries(points, rows, low, width, code, start):
                 row[found], entry[found] = rows[n], e
                 found += 1
     return row, entry
-
-
-SIDE = 1 << 20  # more cubes than any side of a neighbourhood has
-
-#: One number for the integer coordinates of a cube.
-_CODE = np.array([SIDE * SIDE, SIDE, 1])
 
 
 def spread(start: Ints, of: Ints) -> tuple[Ints, Ints]:

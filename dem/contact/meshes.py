@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
-from dem.compiled import loop
+from dem.compiled import inlined, loop
+from dem.contact.ahead import vector_of
 from dem.contact.narrow import (
     Capsules,
     Manifold,
@@ -25,6 +26,8 @@ from dem.contact.narrow import (
     end_ball,
     reversed_touch,
 )
+from dem.geometry.vectors import dot as product
+from dem.geometry.vectors import plus
 from dem.mesh import Closest, Surface, spread
 from dem.quaternion import length
 
@@ -125,7 +128,7 @@ def _least_around(center, reach, row, triangle, found, normal, corners):
     """Of the closest points of triangles (m,) to the centres of these rows (m,) of balls those (k,) that are within
     reach, and least around them: one for each ball and feature, in their order; and the directions (k, 3) from there to
     the centres."""
-    (point, feature, distance), (vertex, start, other), faces = found, corners, len(normal)
+    (point, feature, distance), faces = found, len(normal)
     least, away, count, first = np.empty(len(row), np.int64), np.empty((len(row), 3)), 0, 0
     for n in range(len(row)):
         if n and row[n] != row[n - 1]:
@@ -138,17 +141,12 @@ def _least_around(center, reach, row, triangle, found, normal, corners):
             at -= 1
         if at > first and feature[least[at - 1]] == feature[n]:
             continue  # triangles share edges and vertices
-        x, y, z = normal[triangle[n], 0], normal[triangle[n], 1], normal[triangle[n], 2]
+        x, y, z = vector_of(normal[triangle[n]], 0)
         if size > 0.0:
-            x, y, z = center[row[n], 0] - point[n, 0], center[row[n], 1] - point[n, 1], center[row[n], 2] - point[n, 2]
+            x, y, z = plus(vector_of(center[row[n]], 0), -1.0, vector_of(point[n], 0))
             x, y, z = x / size, y / size, z / size
-        inside, rim = True, feature[n] - faces
-        if rim >= 0 and size > 0.0:
-            for e in range(start[rim], start[rim + 1]):
-                o = other[e]
-                u, v, w = vertex[o, 0] - point[n, 0], vertex[o, 1] - point[n, 1], vertex[o, 2] - point[n, 2]
-                inside &= not (u * x + v * y + w * z > ROUNDING * np.sqrt(u * u + v * v + w * w))
-        if not inside:
+        rim = feature[n] - faces
+        if size > 0.0 and rim >= 0 and not _is_least(corners, rim, vector_of(point[n], 0), (x, y, z), ROUNDING):
             continue
         for k in range(count, at, -1):
             least[k], away[k] = least[k - 1], away[k - 1]
@@ -157,15 +155,32 @@ def _least_around(center, reach, row, triangle, found, normal, corners):
     return least[:count], away[:count]
 
 
+@inlined
+def _is_least(corners, rim, place, away, slack):
+    """Whether a place on an edge or at a vertex, number `rim` of both, is closer to what is in the direction `away`
+    than others of the surface around it. `corners` are the vertices and `Surface.around`."""
+    vertex, start, other = corners
+    for e in range(start[rim], start[rim + 1]):
+        offset = plus(vector_of(vertex[other[e]], 0), -1.0, place)
+        if product(offset, away) > slack * np.sqrt(product(offset, offset)):
+            return False
+    return True
+
+
 def within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, slack: float) -> Bools:
     """Which points (k, 3) of features (k,) are closest, among those of the surface around them, to what is in the
     direction `away` (k, 3) from them; always those over faces."""
-    inside = np.ones(len(feature), dtype=bool)
-    rim = np.flatnonzero(feature >= len(surface.triangle))
-    start, vertex = surface.around
-    row, entry = spread(start, feature[rim] - len(surface.triangle))
-    offset = surface.vertex[vertex[entry]] - point[rim[row]]
-    inside[rim[row[dot(offset, away[rim[row]]) > slack * length(offset)]]] = False
+    corners = surface.vertex, *surface.around
+    inside: Bools = _are_least(corners, feature - len(surface.triangle), point, away, slack)
+    return inside
+
+
+@loop
+def _are_least(corners, rim, point, away, slack):
+    """The loop of `within_cone`; over faces `rim` is negative."""
+    inside = np.empty(len(rim), np.bool_)
+    for n in range(len(rim)):
+        inside[n] = rim[n] < 0 or _is_least(corners, rim[n], vector_of(point[n], 0), vector_of(away[n], 0), slack)
     return inside
 
 
