@@ -84,15 +84,14 @@ class TurningMap(ContactMap):
         inverse = np.zeros((self.halo.rows, 9), self.precision)
         inverse[: self.halo.own] = root_blocks(self.mass.square)[:, 1].reshape(-1, 9)
         self.halo.update(inverse)
-        both = inverse[self.body[:, 0]] + inverse[self.body[:, 1]]
-        turn = self._turn.reshape(-1, 3, 3)
-        out[self.contacts :] = turn @ both.reshape(-1, 3, 3) @ turn.transpose(0, 2, 1)
+        turning_blocks(self._turn, self.body, inverse, out[self.contacts :])
         return out
 
     def scaled(self, size: Floats, precision: type[np.floating] = np.float64) -> TurningMap:
         """The map with its rows multiplied by ``size`` (2 nc, 3)."""
-        rows = np.concatenate([self.source.frame, self._turn_source]).reshape(-1, 3, 3) * size[:, :, None]
-        frame, turn = rows.reshape(2, -1, 9)
+        n, (frame, turn) = self.contacts, np.empty((2, self.contacts, 9), precision)
+        loops.scale_frames(self.source.frame, size[:n], frame)
+        loops.scale_frames(self._turn_source, size[n:], turn)
         mass = self.mass.rounded(precision)
         other = TurningMap(self.comm, replace(self.source, frame=frame), turn, self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
@@ -129,3 +128,18 @@ def add_moments(turn, body, g, m):
             moment = turn[c, i] * g[c, 0] + turn[c, 3 + i] * g[c, 1] + turn[c, 6 + i] * g[c, 2]
             m[a, 3 + i] -= moment
             m[b, 3 + i] += moment
+
+
+@loop
+def turning_blocks(turn, body, inverse, out):
+    """out (nc, 3, 3) = turn (I_a^-1 + I_b^-1) turn' for the ``inverse`` (bodies, 9) of the moments of inertia."""
+    for c in range(len(body)):
+        a, b = body[c, 0], body[c, 1]
+        for i in range(3):
+            x = y = z = turn.dtype.type(0)
+            for k in range(3):
+                x += turn[c, 3 * i + k] * (inverse[a, 3 * k] + inverse[b, 3 * k])
+                y += turn[c, 3 * i + k] * (inverse[a, 3 * k + 1] + inverse[b, 3 * k + 1])
+                z += turn[c, 3 * i + k] * (inverse[a, 3 * k + 2] + inverse[b, 3 * k + 2])
+            for j in range(3):
+                out[c, i, j] = x * turn[c, 3 * j] + y * turn[c, 3 * j + 1] + z * turn[c, 3 * j + 2]

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dem.compiled import inlined, loop
 from dem.exchange import reduced
@@ -71,7 +72,12 @@ def figures(problem: ConeProblem, g: Array, rigid: Array) -> Accuracy:
     if type(problem.cones) is FrictionCones:
         sums, greatest = _judged(g, rigid, soft, problem.r, problem.mu, step)
     else:
-        sums, greatest = _judged_discs(problem, g, rigid + problem.compliance * g + problem.r, step)
+        cones, disc = problem.cones, np.zeros(3 * problem.cones.parts, int)
+        for k, part in enumerate(cones.tangents):
+            disc[list(part)] = k
+        y = rigid + problem.compliance * g + problem.r
+        joined = cones.joined(g), cones.joined(y), cones.joined(problem.r)
+        sums, greatest = _judged_discs(joined, cones.coefficients, disc, step)
     of_all, (cone, dual, complementarity, closes) = reduced(problem.comm, sums, greatest)
     square, speed, power, pushed, closing, opening, natural, coulomb = of_all
     norm, energy = math.sqrt(square), 0.5 * pushed
@@ -155,38 +161,80 @@ def _nearest_in_cone(n, u, v, mu):
     return n, u, v
 
 
+@loop
 def _judged_discs(
-    problem: ConeProblem, g: Array, y: Array, step: float
-) -> tuple[Sequence[float], Sequence[float]]:
-    """The figures of `_judged` for any cones that discs meet; the height of a projection by Newton's method, whose
-    steps ascend to it from below and end after one for each disc, as the function is concave with as many kinks."""
-    cones, most = problem.cones, problem.cones.coefficients
-    g, y, r = (cones.joined(x) for x in (g, y, problem.r))
+    rows: tuple[Array, Array, Array], most: Array, disc: NDArray[np.intp], step: float
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The figures of `_judged` of g, y and r (nc, width) for any cones that discs meet, with coefficients `most`
+    (discs, nc): `disc` (width,) says on which a number lies; the first one lies on none."""
+    g, y, r = rows
+    sums, greatest = np.zeros(8), np.zeros(4)
+    sizes, move = np.zeros((3, len(most))), np.zeros(len(disc))  # of impulses, velocities and targets
+    for c in range(len(g)):
+        square, speed, along, free, resisted, outside = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(len(disc)):
+            square, speed = square + g[c, j] ** 2, speed + y[c, j] ** 2
+            along, free = along + g[c, j] * y[c, j], free + g[c, j] * r[c, j]
+        for of, (one, other) in enumerate(((1.0, 0.0), (0.0, 1.0), (1.0, -step))):
+            _set_sizes(one, g[c], other, y[c], disc, sizes[of])
+        for k in range(len(most)):
+            resisted += most[k, c] * sizes[1, k]
+            outside = _larger(outside, sizes[0, k] - most[k, c] * g[c, 0])
+        closing = _larger(0.0, -y[c, 0])
+        sums[0] += square
+        sums[1] += speed
+        sums[2] += along + free
+        sums[3] += along - free
+        sums[4] += g[c, 0] * closing
+        sums[5] += _larger(0.0, along)
+        for law in range(2):
+            normal = g[c, 0] - step * (y[c, 0] + law * resisted)
+            height = _height(normal, sizes[2], most[:, c])
+            move[0] = height - g[c, 0]
+            for j in range(1, len(disc)):
+                size, radius = sizes[2, disc[j]], most[disc[j], c] * height
+                target = g[c, j] - step * y[c, j]
+                move[j] = (target * (radius / size) if size > radius else target) - g[c, j]
+            square = (move * move).sum()
+            sums[6 + law] += 0.0 if np.sqrt(square) <= ROUNDINGS * step * np.sqrt(speed) else square
+        greatest[0] = _larger(greatest[0], outside)
+        greatest[1] = _larger(greatest[1], resisted - y[c, 0])
+        greatest[2] = _larger(greatest[2], abs(along))
+        greatest[3] = _larger(greatest[3], closing)
+    return (
+        (sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]),
+        (greatest[0], greatest[1], greatest[2], greatest[3]),
+    )
 
-    def parts(x: Array) -> tuple[Array, Array]:
-        return x[:, 0], np.stack([np.sqrt(np.square(x[:, list(part)]).sum(axis=1)) for part in cones.tangents])
 
-    def squared_move(y_n: Array) -> float:
-        target = g - step * y
-        target[:, 0] = g[:, 0] - step * y_n
-        normal, sizes = parts(target)
-        height = normal
-        for _ in range(len(most) + 2):
-            beyond = sizes > most * height
-            height = (normal + (most * sizes * beyond).sum(axis=0)) / (1.0 + (most**2 * beyond).sum(axis=0))
-        height = np.maximum(height, 0.0)
-        shrink = np.minimum(1.0, most * height / np.maximum(sizes, 1e-300))
-        target[:, 0] = height
-        for part, factor in zip(cones.tangents, shrink):
-            target[:, list(part)] *= factor[:, None]
-        squares, noise = np.square(target - g).sum(axis=1), ROUNDINGS * step * np.sqrt(np.square(y).sum(axis=1))
-        return float(squares[~(np.sqrt(squares) <= noise)].sum())
+@inlined
+def _larger(x, y):
+    return x if x >= y or x != x else y  # a NaN stays
 
-    (g_n, sizes), (y_n, speeds) = parts(g), parts(y)
-    resisted, along = (most * speeds).sum(axis=0), np.einsum("ck,ck->c", g, y)
-    sums = [
-        np.vdot(g, g), np.vdot(y, y), np.vdot(g, y + r), np.vdot(g, y - r),
-        g_n @ np.maximum(-y_n, 0.0), np.maximum(along, 0.0).sum(), squared_move(y_n), squared_move(y_n + resisted),
-    ]  # fmt: skip
-    outside = np.max(sizes - most * g_n, initial=0.0), np.max(resisted - y_n, initial=0.0)
-    return sums, [*outside, np.abs(along).max(initial=0.0), np.max(-y_n, initial=0.0)]
+
+@inlined
+def _set_sizes(one, g, other, y, disc, sizes):
+    """The sizes (discs,) of the parts of one g + other y (width,)."""
+    sizes[:] = 0.0
+    for j in range(1, len(disc)):
+        sizes[disc[j]] += (one * g[j] + other * y[j]) ** 2
+    for k in range(len(sizes)):
+        sizes[k] = np.sqrt(sizes[k])
+
+
+@inlined
+def _height(normal, sizes, most):
+    """The height of the projection of a point, whose parts have these sizes (discs,), on a cone with the coefficients
+    `most` (discs,): by Newton's method, whose steps ascend from below and end after one for each disc, as the function
+    is concave with as many kinks."""
+    height = normal
+    for _ in range(len(most) + 2):
+        above, below = normal, 1.0
+        for k in range(len(most)):
+            if sizes[k] > most[k] * height:
+                above += most[k] * sizes[k]
+                below += most[k] * most[k]
+        last, height = height, above / below
+        if height == last:
+            break
+    return _larger(0.0, height)

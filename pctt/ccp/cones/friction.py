@@ -18,7 +18,7 @@ from dem.compiled import PART, inlined, inner, loop, prange
 from pctt.arrays import Array, tangential
 from pctt.ccp.cones.base import Cones, Units, floats
 
-_NONE = 1.0, np.empty((0, 3))
+NO_UNITS = 1.0, np.empty((0, 3))
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 STRIP, PIECE = 256, 128  # contacts whose numbers stay in the nearest cache from one loop to the next; of their sums
 NO_MOVE = 64.0 * float(np.finfo(float).eps) ** 2  # (8 eps)^2: |move|^2 / |step y|^2 that rounding makes
@@ -86,7 +86,7 @@ def errors(
         friction = mu[first : first + STRIP]
         a, b = 3 * first, 3 * (first + len(friction))
         if scaled:
-            _in_units(x[a:b], y[a:b], unit, size[a:b], g, v)
+            in_units(x[a:b], y[a:b], unit, size[a:b], g, v)
         else:
             g[: b - a], v[: b - a] = x[a:b], y[a:b]
         _add_moves(g, v, step, friction, de_saxce, sums[0])
@@ -94,7 +94,7 @@ def errors(
     greatest = 0.0
     for k in range(room):
         greatest = most[k] if most[k] > greatest or most[k] != most[k] else greatest
-    return (_sum(sums[0]), _sum(sums[1]), _sum(sums[2]), _sum(sums[3]), _sum(sums[4])), greatest
+    return (sum_of(sums[0]), sum_of(sums[1]), sum_of(sums[2]), sum_of(sums[3]), sum_of(sums[4])), greatest
 
 
 @inlined
@@ -104,7 +104,7 @@ def _room(count, most):
 
 
 @inner
-def _sum(x):
+def sum_of(x):
     """The sum of numbers, of eight side by side in each of their pieces."""
     total = 0.0
     for first in range(0, len(x), PIECE):
@@ -117,7 +117,7 @@ def _sum(x):
 
 
 @inner
-def _in_units(x, y, unit, size, g, v):
+def in_units(x, y, unit, size, g, v):
     for k in range(len(x)):
         g[k], v[k] = x[k] * (unit / size[k]), y[k] * (unit * size[k])
 
@@ -335,7 +335,7 @@ class FrictionCones(Cones):
         self, g: Array, y: Array, r: Array, step: float, coulomb: bool, units: Units | None = None
     ) -> tuple[Sequence[float], float]:
         found: tuple[Sequence[float], float]
-        found = errors(g, y, r, step, self.mu, float(coulomb), *(units or _NONE))
+        found = errors(g, y, r, step, self.mu, float(coulomb), *(units or NO_UNITS))
         return found
 
     def active(self, x: Array, last_x: Array, y: Array, least: float) -> NDArray[np.bool_]:
