@@ -261,33 +261,63 @@ def _rounded(both, count, rows, axis, apart):
 
 
 @inner
-def _slopes(t, edges, edge, points, faces, normals, out):
-    """Fill in the scalar products of the edges of a polyhedron with normals of the other one."""
-    for e in range(edges):
-        a, b = edge[e, 0], edge[e, 1]
-        x, y, z = plus(points[t, b], -1.0, points[t, a])
-        for f in range(faces):
-            u, v, w = normals[1 - t, f, 0], normals[1 - t, f, 1], normals[1 - t, f, 2]
-            out[t, e, f] = x * u + y * v + z * w
+def _set_heights(t, faces, normals, level, points, many, height):
+    """Fill in the heights (faces, points) of points above the faces of the first or the second polyhedron."""
+    for f in range(faces):
+        u, v, w, at = normals[t, f, 0], normals[t, f, 1], normals[t, f, 2], level[t, f]
+        for k in range(many):
+            height[t, f, k] = u * points[k, 0] + v * points[k, 1] + w * points[k, 2] - at
 
 
 @inner
-def _crossing(both, count, sides, rows, tie, slopes):
+def _may_part(t, edges, wing, height, many, least, some):
+    """Fill in the edges of a polyhedron, the first or the second (`t` 0 or 1), along which the two may be apart by
+    `least`, which is not positive; how many. No normal between those of the two faces at an edge parts them by more
+    than a vertex of the other one is behind both faces."""
+    found = 0
+    for e in range(edges):
+        one, other, k = height[t, wing[e, 0]], height[t, wing[e, 1]], 0
+        while k < many and not (one[k] < least and other[k] < least):
+            k += 1
+        some[t, found] = e
+        found += k == many
+    return found
+
+
+@inner
+def _set_slopes(t, many, some, edge, faces, height, out):
+    """Fill in the scalar products of these edges of the first or the second polyhedron with the normals of the other
+    one."""
+    for n in range(many):
+        a, b = edge[some[t, n], 0], edge[some[t, n], 1]
+        for f in range(faces):
+            out[t, n, f] = height[1 - t, f, b] - height[1 - t, f, a]
+
+
+@inner
+def _crossing(both, count, sides, rows, tie, least, room):
     """How far the polyhedra are apart along the common normal of two edges, the furthest, the two edges, and the
-    normal: two edges whose normals cross on the sphere make a face of the difference of the two."""
-    (points, normals, _), (_, _, edge, wing), (g, h) = both, sides, rows
+    normal: two edges whose normals cross on the sphere make a face of the difference of the two. What parts them by
+    less than `least`, which is not positive, need not be found."""
+    (points, normals, level), (_, _, edge, wing), (g, h), (height, some, slopes) = both, sides, rows, room
     p, q, p_normal, own, others = points[0], points[1], normals[0], edge[g], edge[h]
-    _slopes(FIRST, count[g, 2], own, points, count[h, 1], normals, slopes)
-    _slopes(SECOND, count[h, 2], others, points, count[g, 1], normals, slopes)
+    _set_heights(FIRST, count[g, 1], normals, level, q, count[h, 0], height)
+    _set_heights(SECOND, count[h, 1], normals, level, p, count[g, 0], height)
+    many = _may_part(FIRST, count[g, 2], wing[g], height, count[h, 0], least, some)
+    more = _may_part(SECOND, count[h, 2], wing[h], height, count[g, 0], least, some)
+    _set_slopes(FIRST, many, some, own, count[h, 1], height, slopes)
+    _set_slopes(SECOND, more, some, others, count[g, 1], height, slopes)
     best, one, two, axis = -np.inf, -1, -1, (0.0, 0.0, 0.0)
-    for e in range(count[g, 2]):
+    for m in range(many):
+        e = some[0, m]
         left, right = wing[g, e, 0], wing[g, e, 1]
         a, b = own[e, 0], own[e, 1]
         x, y, z = plus(p[b], -1.0, p[a])
         square = x * x + y * y + z * z
-        for d in range(count[h, 2]):
-            s, t = slopes[0, e, wing[h, d, 0]], slopes[1, d, right]
-            if s * slopes[0, e, wing[h, d, 1]] < 0.0 and slopes[1, d, left] * t < 0.0 and s * t < 0.0:
+        for n in range(more):
+            d = some[1, n]
+            s, t = slopes[0, m, wing[h, d, 0]], slopes[1, n, right]
+            if s * slopes[0, m, wing[h, d, 1]] < 0.0 and slopes[1, n, left] * t < 0.0 and s * t < 0.0:
                 c, k = others[d, 0], others[d, 1]
                 i, j, k = q[k, 0] - q[c, 0], q[k, 1] - q[c, 1], q[k, 2] - q[c, 2]
                 u, v, w = y * k - z * j, z * i - x * k, x * j - y * i
@@ -604,12 +634,13 @@ def _frame(normal, sign, one, other, frame):
 @inlined
 def _room(faces, sides):
     """Room for a pair, the first and the second polyhedron in a row: vertices, normals and levels of their faces;
-    vertices without their skins; slopes of edges; a frame, the polygons of two faces, what these share; a simplex."""
+    vertices without their skins; heights, edges and slopes of these; a frame, the polygons of two faces, what these share; a simplex."""
     v, f, s, e = faces[2].shape[1], faces[3].shape[1], sides[0].shape[2], sides[2].shape[1]
     both, core = (np.empty((2, v, 3)), np.empty((2, f, 3)), np.empty((2, f))), np.empty((2, v, 3))
     polygons = np.empty((2, s, 3)), np.empty((2, s, 3)), np.empty((2, 3)), np.empty((2, s, s))
     shared = np.empty((4 * s, 4)), np.empty(4 * s, np.int64)
-    return both, core, np.empty((2, e, f)), np.empty((3, 3)), polygons, shared, no_simplex()
+    crossed_edges = np.empty((2, f, v)), np.empty((2, e), np.int64), np.empty((2, e, f))
+    return both, core, crossed_edges, np.empty((3, 3)), polygons, shared, no_simplex()
 
 
 @loop
@@ -617,7 +648,7 @@ def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
     """Add to the first contacts those of the pairs that are not done, as long as there is room for the `most` that a
     pair has; new numbers of pairs done and contacts found."""
     (sharp, count, _, _), (corner, _, edge, _), (done, found), turns = faces, sides, progress, (first[1], second[1])
-    both, core, slopes, frame, polygons, shared, simplex = _room(faces, sides)
+    both, core, crossed_edges, frame, polygons, shared, simplex = _room(faces, sides)
     for m in range(done, len(delta)):
         if found + most > len(contacts[2]):
             return m, found
@@ -633,7 +664,8 @@ def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
             continue
         crossed, edges, axis = -np.inf, (-1, -1), (0.0, 0.0, 0.0)
         if flush <= CLOSE * size:  # where faces part the two, edges matter only if no face is clearly the nearest
-            crossed, edges, axis = _crossing(both, count, sides, rows, tie, slopes)
+            least = min(flush - tolerance, 0.0) - tie
+            crossed, edges, axis = _crossing(both, count, sides, rows, tie, least, crossed_edges)
         apart = max(flush, crossed)
         if apart > reach:
             continue
@@ -646,7 +678,7 @@ def _pairs(faces, sides, inset, first, second, delta, most, progress, contacts):
                     found += laid
                     continue
         if flush > CLOSE * size:  # else the direction is that of the closest points where edges and corners are round
-            crossed, edges, axis = _crossing(both, count, sides, rows, tie, slopes)
+            crossed, edges, axis = _crossing(both, count, sides, rows, tie, -np.inf, crossed_edges)
         limits = reach, tie, tolerance, skin, more, CLOSE * size
         closest = _closest_cores(both[0], (count, inset), turns, m, rows, between, limits, core, simplex)
         core_gap, way, _, _ = closest
