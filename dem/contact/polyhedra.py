@@ -634,7 +634,8 @@ def _frame(normal, sign, one, other, frame):
 @inlined
 def _room(faces, sides):
     """Room for a pair, the first and the second polyhedron in a row: vertices, normals and levels of their faces;
-    vertices without their skins; heights, edges and slopes of these; a frame, the polygons of two faces, what these share; a simplex."""
+    vertices without their skins; heights, edges and slopes of these; a frame, the polygons of two faces, what these
+    share; a simplex."""
     v, f, s, e = faces[2].shape[1], faces[3].shape[1], sides[0].shape[2], sides[2].shape[1]
     both, core = (np.empty((2, v, 3)), np.empty((2, f, 3)), np.empty((2, f))), np.empty((2, v, 3))
     polygons = np.empty((2, s, 3)), np.empty((2, s, 3)), np.empty((2, 3)), np.empty((2, s, s))

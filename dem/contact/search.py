@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -135,6 +136,7 @@ def _frames(normal: Floats) -> Floats:
 def find_contacts(
     world: World, delta: float, free: UnconstrainedMotion | None = None, margin: Floats | float = 0.0,
     shifts: Floats | None = None, lists: Lists | None = None, besides: Contacts | None = None,
+    among: Callable[[Neighbourhood], Bools] | None = None,
 ) -> Contacts:  # fmt: skip
     """Return all contacts that this rank owns of the pairs whose margins meet; collective.
 
@@ -144,7 +146,8 @@ def find_contacts(
     two. `margin` (grains,) [m] are the least margins of the local grains, `shifts` (k, large, 6) [m, rad] further ways
     and turns of the large bodies that their margins are to cover. A contact belongs to the rank that owns the body of
     lower global index. `lists`: those of an earlier search that may hold; None: those of the world. With `besides`,
-    contacts that a search with margins not greater has found, only those are found that are not among them.
+    contacts that a search with margins not greater has found, only those are found that are not among them; `among`
+    tells which grains and ghosts (n,) of a neighbourhood to find contacts of, with any others, if not all.
     """
     if not 0.0 <= delta < math.inf:
         raise ValueError(f"contact distance delta must not be negative, got {delta:g}")
@@ -152,7 +155,8 @@ def find_contacts(
     refuse_short(world, margin)
     lists = grain_lists(world, world.lists if lists is None else lists, margin, travel)
     base, images = refreshed(lists.near, lists.halo, world, margin), lists.images.now(world.cell)
-    near, grown = images.among(base), _grown(base, shifts, besides)[images.rows]
+    grown = _grown(base, shifts, besides) if among is None else among(base)
+    near, grown = images.among(base), grown[images.rows]
     table = lists.table.now(near)
     pairs = _that_touch(world, near, table, meeting(world, near, lists, table, delta, shifts, grown))
     table, i, j, reach = table.of_members(*pairs)

@@ -20,8 +20,9 @@ from dem.contact import Contacts, contact_order, exceeds_margin, find_contacts, 
 from dem.contact_map.loops import relative_velocities
 from dem.exchange import on_any
 from dem.measures import Sample
+from dem.model.neighbourhood import Neighbourhood
 from dem.model.world import World
-from dem.shapes.forms import arms
+from dem.shapes.forms import Form, arms
 from dem.step.laws import along_normal
 from dem.step.system import ContactSystem, contact_arms, gap_velocities
 from dem.together import barrier
@@ -241,7 +242,8 @@ def find_turned(
     dt = free.dt
     if not _turn(world, velocity[: len(world.grains)], dt, depth):
         return None
-    end = find_contacts(advanced(world, free, contacts, velocity), 0.0)
+    turn = None if world.large_moves else partial(_turning, forms=world.forms, dt=dt, depth=depth)
+    end = find_contacts(advanced(world, free, contacts, velocity), 0.0, among=turn)
     end = end.take(end.gap < -depth)
     large = large_velocity(world, free, velocity)
     foreseen = _foreseen(world, contacts, velocities_about(contacts, velocity, large), dt, end.key)
@@ -320,27 +322,29 @@ def _turn(world: World, velocity: Floats, dt: float, depth: float) -> bool:
     if world.only_spheres:
         return False
     grains = world.grains
-    fast, not_finite = on_any(world.comm, *turned(velocity, grains.shape, grains.size, arms(world.forms), dt, depth))
-    return fast and not not_finite
+    fast = turned(velocity, grains.shape, grains.size, arms(world.forms), dt, depth)
+    any_fast, not_finite = on_any(world.comm, bool(fast.any()), not np.isfinite(velocity).all())
+    return any_fast and not not_finite
+
+
+def _turning(near: Neighbourhood, forms: tuple[Form, ...], dt: float, depth: float) -> Bools:
+    """Which grains and ghosts turn so."""
+    table, seen = near.bodies, near.grains + near.ghosts
+    return turned(table.velocity[:seen], table.shape[:seen], table.size[:seen], arms(forms), dt, depth)
 
 
 @loop
-def turned(
-    velocity: Floats, shape: Ints, size: Floats, arms: Floats, dt: float, depth: float
-) -> tuple[bool, bool]:
-    """The loop of `_turn` over grains of shapes (n,) and sizes (n, 3), with the `arms` (forms,) of clumps: whether one
-    turns so far, and whether a velocity (n, 6) is not finite."""
-    fast, not_finite = False, False
+def turned(velocity: Floats, shape: Ints, size: Floats, arms: Floats, dt: float, depth: float) -> Bools:
+    """Which grains of shapes (n,) and sizes (n, 3), with the `arms` (forms,) of clumps, turn as `_turn` says."""
+    fast = np.zeros(len(shape), np.bool_)
     for n in range(len(shape)):
         x, y, z = velocity[n, 3], velocity[n, 4], velocity[n, 5]
         angle = dt * np.sqrt(x * x + z * z + y * y)
         way = radius_about(shape[n], size[n]) * angle
         if CLUMP <= shape[n] < POLYHEDRON:
             way = arms[shape[n] - CLUMP] * angle**2
-        fast = fast or (shape[n] != SPHERE and way > depth)
-        for k in range(6):
-            not_finite = not_finite or not np.isfinite(velocity[n, k])
-    return fast, not_finite
+        fast[n] = shape[n] != SPHERE and way > depth
+    return fast
 
 
 def _at_start(world: World, end: Contacts, velocity: Floats, dt: float) -> tuple[Contacts, Floats]:

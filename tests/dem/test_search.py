@@ -244,3 +244,25 @@ def test_keys_tell_the_contacts_of_a_million_million_grains_apart():
     key = np.concatenate([one + 1j * (last * features + features - 1) for one in last])
     np.testing.assert_array_equal(places(key, key[::-1]), np.arange(9)[::-1])
     assert places(key, key[:1] - 1j).tolist() == [-1]
+
+
+@pytest.mark.parallel(2)
+@pytest.mark.parametrize("period", [None, (1.2, 1.2, None)])
+def test_a_search_among_some_grains_finds_their_contacts_alone(period):
+    """Those of every third grain, with other grains, images and walls, and of large bodies with each other."""
+    scene, rng = Scene(0.5, period=period), np.random.default_rng(8)
+    places = np.indices((6, 6, 3)).reshape(3, -1).T * 0.2 + 0.1
+    scene.add_boxes(places + rng.uniform(-0.01, 0.01, places.shape), (0.085, 0.075, 0.08), 1e3)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_body("block", [Box((0.1, 0.1, 0.1))], position=(0.6, 0.6, 0.75))
+
+    def third(near):
+        return near.bodies.id[: near.grains + near.ghosts] % 3 == 0
+
+    world = new_world(scene, MPI.COMM_WORLD)
+    every, some = (contacts_by_key(find_contacts(world, 0.04, among=of), world.comm) for of in (None, third))
+    grains, a, b = world.slabs[-1], every["a"], every["b"]
+    wanted = ((a % 3 == 0) & (a < grains)) | ((b % 3 == 0) & (b < grains))
+    assert 50 < wanted.sum() < 0.8 * len(wanted)
+    for name in ("key", "a", "b", "gap"):
+        assert np.array_equal(every[name][wanted], some[name])

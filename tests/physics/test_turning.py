@@ -10,7 +10,7 @@ from drive import RADIUS, spinning
 from mpi4py import MPI
 from several_ranks import alone
 
-from dem import quaternion
+from dem import quaternion, step
 from dem.contact import find_contacts
 from dem.record.energies import energy
 from dem.scene import Scene
@@ -174,3 +174,26 @@ def table_of(comm):
 def test_what_is_found_does_not_depend_on_the_number_of_ranks(ranks):
     for here, there in zip(table_of(MPI.COMM_WORLD), alone(table_of)):
         np.testing.assert_allclose(here, there, atol=1e-12, err_msg=f"{ranks} ranks")
+
+
+def test_only_contacts_of_bodies_that_turn_are_looked_for_again(monkeypatch):
+    """Of sixteen stacks of two boxes one top box spins on the other."""
+    places = np.indices((4, 4)).reshape(2, -1).T
+    low, high = (np.column_stack([0.5 * places, np.full(16, z)]) for z in (0.1, 0.3))
+    scene, spin = Scene(friction=0.3), np.zeros((16, 3))
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    spin[5] = 0, 0, 4.0
+    scene.add_boxes(low, (0.1, 0.1, 0.1), 1e3)
+    scene.add_boxes(high, (0.1, 0.1, 0.1), 1e3, angular_velocity=spin)
+    search, bodies = step.find_contacts, []
+
+    def watched(*given, **named):
+        found = search(*given, **named)
+        if "among" in named:
+            bodies.extend(found.near.bodies.id[found.a])
+            bodies.extend(found.near.bodies.id[found.b])
+        return found
+
+    monkeypatch.setattr(step, "find_contacts", watched)
+    Simulation(scene, dt=0.005, comm=MPI.COMM_SELF).run(steps=4)
+    assert set(bodies) == {5, 16 + 5}
