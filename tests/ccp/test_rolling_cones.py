@@ -155,3 +155,32 @@ def test_conic_does_not_depend_on_the_ranks(law):
     found = ccp.solve(problem, None, "conic", limits, law=law)
     assert found.converged, found.reason
     np.testing.assert_allclose(found.impulse, alone.impulse[rows], atol=1e-6)
+
+
+@pytest.mark.parametrize("coulomb", [False, True])
+@pytest.mark.parametrize(("precision", "near"), [(np.float32, 2e-5), (np.float64, 1e-12)])
+def test_loops_over_many_contacts_do_what_arrays_do(precision, near, coulomb):
+    """More contacts than a strip of the loops has, and not a whole number of strips."""
+    rng, count = np.random.default_rng(9), 700
+    some = (rng.uniform(0.0, 0.6, (3, count)) * (np.arange(3)[:, None] != np.arange(count) % 9)).astype(precision)
+    cones, shape = ccp.RollingCones(*some), (2 * count, 3)
+    x, last, y, soft = (rng.standard_normal(shape).astype(precision) for _ in range(4))
+    x, out, soft = cones.project(x, x), np.empty_like(x), abs(soft)
+    soft[count:] = 0.0  # moments have no compliance
+    found = cones.accelerated_step(x, last, y, soft, 0.4, 0.3, coulomb, out)
+    z = x + precision(0.4) * (x - last)
+    gradient = y + soft * z
+    assert np.allclose(out, z + cones.move(z, gradient, 0.3, coulomb), atol=near)
+    if coulomb:
+        gradient[:count, 0] += cones.de_saxce(gradient)
+    expected = (soft * (out - z) ** 2).sum(), ((out - z) ** 2).sum(), (gradient * (out - x)).sum()
+    if precision is np.float64:
+        assert found == pytest.approx(expected, rel=1e-10)
+        r, size = rng.standard_normal(shape), rng.uniform(0.5, 2.0, shape)
+        sums, fastest = cones.errors(x, y, r, 0.3, coulomb, (2.0, size))
+        g, v = x * (2.0 / size), y * (2.0 * size)
+        power, closing = (g * v).sum(axis=1).reshape(2, -1).sum(axis=0), np.maximum(-v[:count, 0], 0.0)
+        works = g[:count, 0] @ closing, np.maximum(power, 0.0).sum(), 0.5 * (g * (v - r)).sum()
+        move = np.square(cones.move(g, v, 0.3, coulomb)).sum()
+        assert sums == pytest.approx((move, (g * g).sum(), *works), rel=1e-10)
+        assert fastest == closing.max()
