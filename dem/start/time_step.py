@@ -11,13 +11,12 @@ import math
 
 import numpy as np
 
-from dem import bodies
+from dem import bodies, quaternion
 from dem.arrays import Floats
-from dem.contact.primitives import extents
-from dem.motion import top_speed
+from dem.motion import greatest_speed, top_speed
 from dem.parts.named import Pressing
 from dem.scene import LargeBody, Scene
-from dem.shapes import Plane
+from dem.shapes import Plane, outline
 from dem.start.falls import fall
 from dem.start.pressing import pressing
 from dem.start.toppling import toppling
@@ -127,10 +126,12 @@ def _fall(scene: Scene) -> float:
 
 def _top_speed(body: LargeBody) -> float:
     """The greatest speed of a point of a large body [m/s]; a plane has no end, and counts by the body's centre."""
-    parts = tuple(shape for shape in body.shapes if not isinstance(shape, Plane))
-    reach = float(extents([parts])[0]) if parts else 0.0
-    start = float(np.linalg.norm(body.velocity[:3]) + np.linalg.norm(body.velocity[3:]) * reach)
-    return max(start, top_speed(body.motion, body.position, reach))
+    parts = [outline(shape) for shape in body.shapes if not isinstance(shape, Plane)]
+    parts = parts or [(np.zeros((1, 3)), np.zeros(1))]
+    point, radius = (np.concatenate(column) for column in zip(*parts))
+    point = body.position + quaternion.rotate(body.quaternion, point)
+    start = greatest_speed(body.velocity, body.position, point, radius)
+    return max(start, top_speed(body.motion, body.position, point, radius))
 
 
 def _rounded(seconds: float) -> float:
