@@ -280,7 +280,9 @@ class Simulation:
         if until is not None:
             left = min(left, self._steps_until(float(until)))
         first, end, ends = self.steps, self.steps + left, False
-        (watched,) = on_any(self.comm, call is not None or stop is not None)
+        called, watched = on_any(self.comm, call is not None, call is not None or stop is not None)
+        if every != 1 and not called:
+            raise OptionError(f"run(every={every}): is for call=...; write(every=...) is for the recorded steps")
         progress_report = report.Progress(self.comm, quiet=not progress)
         progress_report.passed(first, self.time, end)
 
