@@ -371,24 +371,33 @@ def refuse_ignored(motion: Motion) -> None:
         raise ValueError(f"the motion {motion!r}: allowed is an object of dem.motion, or one with a method pose")
 
 
-def top_speed(motion: Motion, position: Floats, reach: float) -> float:
-    """The greatest speed [m/s] that a motion or its servo gives to points within the `reach` [m] of the centre of a
-    body which is at `position` (3,) at time zero; 0 of motions that are not of this module."""
+def top_speed(motion: Motion, position: Floats, point: Floats, radius: Floats) -> float:
+    """The greatest speed [m/s] that a motion or a servo gives to what is within `radius` (n,) [m] of `point` (n, 3) [m]
+    at time zero, of a body which is then at `position` (3,); 0 of motions that are not of this module."""
+    still, along, about, center = np.zeros(3), np.zeros(3), np.zeros(3), position
     if isinstance(motion, Rotation):
-        of_center = np.linalg.norm(np.cross(motion.velocity, position - np.array(motion.center)))
-        return float(of_center + np.linalg.norm(motion.velocity) * reach)
-    if isinstance(motion, Oscillation):
-        return abs(2.0 * np.pi * motion.amplitude / motion.period)
-    if isinstance(motion, Glide):
-        return float(np.linalg.norm(motion.velocity))
-    if isinstance(motion, Path):
-        distances = np.linalg.norm(np.diff(np.array(motion.positions), axis=0), axis=1)
-        return float((distances / np.diff(motion.times)).max(initial=0.0))
-    if isinstance(motion, Held):
+        about, center = np.array(motion.velocity), np.array(motion.center)
+    elif isinstance(motion, Oscillation):
+        along = 2.0 * np.pi * motion.amplitude / motion.period * np.array(motion.direction)
+    elif isinstance(motion, Glide):
+        along = np.array(motion.velocity)
+    elif isinstance(motion, Path):
+        speeds = np.diff(np.array(motion.positions), axis=0) / np.diff(motion.times)[:, None]
+        along = max(speeds, key=np.linalg.norm, default=still)
+    elif isinstance(motion, Held):
         along, about = np.array([value or 0.0 for value in (*motion.velocity, *motion.angular_velocity)]).reshape(2, 3)
-        return float(np.linalg.norm(along) + np.linalg.norm(about) * reach)
-    speed = abs(getattr(motion, "speed", None) or 0.0)
-    return speed * reach if isinstance(motion, Hinged) else speed
+    elif isinstance(motion, Hinged):
+        about = (motion.speed or 0.0) * motion.line
+    elif isinstance(motion, Guided):
+        along = (motion.speed or 0.0) * motion.line
+    return greatest_speed(np.concatenate([along, about]), center, point, radius)
+
+
+def greatest_speed(velocity: Floats, center: Floats, point: Floats, radius: Floats) -> float:
+    """The greatest speed [m/s] within `radius` (n,) of the points (n, 3) [m] of a body which moves and turns about
+    `center` (3,) with `velocity` (6,) for ever: points keep their distances from the axis, by which they go fast."""
+    around = np.linalg.norm(np.cross(velocity[3:], point - center), axis=1) + np.linalg.norm(velocity[3:]) * radius
+    return float(np.linalg.norm(velocity[:3]) + around.max())
 
 
 def changed(motion: Motion, time: float, **values: Any) -> Motion:

@@ -12,7 +12,8 @@ from dem.arrays import Floats, Rule
 from dem.contact.broad import close_pairs
 from dem.geometry.insertion import inserted
 from dem.parts.cell import Cell
-from dem.parts.sizes import Listed, Uniform
+from dem.parts.sizes import Sizes
+from dem.parts.sizes import sizes as sizes_of
 from dem.quaternion import length
 
 SPARSE = 0.1  #: solid fraction up to which spheres are put at random places one after another
@@ -47,7 +48,7 @@ def uniform(low: float, high: float, shape: tuple[int, ...], seed: int) -> Rule:
 
 def random_packing(
     lengths: Sequence[float],
-    radius: float | Uniform | Listed,
+    radius: float | Sequence[float] | Sizes,
     fraction: float,
     *,
     periodic: Sequence[bool] = (False, False, False),
@@ -66,7 +67,7 @@ def random_packing(
     box = checks.vector("lengths of a packing", checks.positive("lengths of a packing", lengths))
     if not 0.0 < fraction < 0.74:
         raise ValueError(f"solid fraction must be between 0 and 0.74, got {fraction:g}")
-    sizes = radius if isinstance(radius, (Uniform, Listed)) else Listed((radius,))
+    sizes = sizes_of(radius)
     if 2.0 * sizes.ends[1] * (2.0 if any(periodic) else 1.0) > box.min():
         raise ValueError(f"spheres of radius {sizes.ends[1]:g} m do not fit into a box with a side of {box.min():g} m")
     random = np.random.default_rng(seed)

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from dem.motion import Rotation as Rotation
     from dem.packing import perturbed as perturbed
     from dem.packing import random_packing as random_packing
+    from dem.parts.sizes import Listed as Listed
     from dem.parts.sizes import Uniform as Uniform
     from dem.scene import Scene as Scene
     from dem.shapes import Box as Box
@@ -59,7 +60,7 @@ _HOMES = {
     "dem.mesh": "Mesh",
     "dem.motion": "Dynamic Fixed Glide Guided Held Hinged Oscillation Path Rotation",
     "dem.packing": "perturbed random_packing",
-    "dem.parts.sizes": "Uniform",
+    "dem.parts.sizes": "Listed Uniform",
     "dem.scene": "Scene",
     "dem.shapes": "Box Capsule Clump Cylinder Plane Sphere Superellipsoid",
     "pctt.beds": "read_spheres",

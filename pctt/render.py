@@ -153,18 +153,27 @@ def _stage(
 def ends_of(colour: str, values: np.ndarray) -> tuple[float, float]:
     """The lowest and the highest value of the colours.
 
-    Ids and materials use the range from 0, and sizes use the smallest and the largest size. Speeds and forces begin at
-    0 and end at a round number that at most one grain in a hundred exceeds. So a few fast grains do not leave the
-    others in one colour.
+    Ids and materials use the range from 0, and sizes the least range with all of them whose quarters are round numbers,
+    which fit beside the bar. Speeds and forces begin at 0 and end at a round number that at most one grain in a hundred
+    exceeds. So a few fast grains do not leave the others in one colour.
     """
     low, high = (values.min(), values.max()) if len(values) else (0.0, 0.0)
     if colour in ("id", "material"):
         return 0.0, max(high, 1.0)
     if colour == "size":
-        return (low, high) if low < 0.999 * high else (0.0, high or 1.0)
+        return _round_ends(low, high) if low < 0.999 * high else (0.0, high or 1.0)
     high = (float(np.quantile(values, 0.99)) if len(values) else 0.0) or 1.0
     step = 10 ** np.floor(np.log10(high))
     return 0.0, step * min(k for k in (1, 2, 4, 6, 8, 10) if k * step >= high)  # a quarter has few digits
+
+
+def _round_ends(low: float, high: float) -> tuple[float, float]:
+    """The ends of four steps of 1, 2 or 5 times a power of ten that hold both."""
+    power = 10.0 ** np.floor(np.log10((high - low) / 4))
+    steps = power * np.array([1, 2, 5, 10, 20])
+    first = np.floor(low / steps * (1 + 1e-9)) * steps
+    k = np.argmax(first + 4 * steps >= high * (1 - 1e-9))
+    return float(first[k]), float(first[k] + 4 * steps[k])
 
 
 def write_film(path: Path, pictures: list[Path], fps: float) -> None:
@@ -175,6 +184,7 @@ def write_film(path: Path, pictures: list[Path], fps: float) -> None:
     kind: dict[str, Any] = {"quality": 7, "output_params": ["-f", "mp4"]}  # the temporary name does not end in it
     if path.suffix == ".gif":
         kind = {"codec": "gif", "pix_fmt_out": "pal8", "output_params": ["-f", "gif", *PALETTE]}
+    kind["ffmpeg_log_level"] = "error"  # its warnings are of colours that are alike
     with whole(path) as temporary, Image.open(pictures[0]) as first:
         writer = imageio_ffmpeg.write_frames(str(temporary), first.size, fps=fps, macro_block_size=2, **kind)
         writer.send(None)

@@ -280,7 +280,9 @@ class Simulation:
         if until is not None:
             left = min(left, self._steps_until(float(until)))
         first, end, ends = self.steps, self.steps + left, False
-        (watched,) = on_any(self.comm, call is not None or stop is not None)
+        called, watched = on_any(self.comm, call is not None, call is not None or stop is not None)
+        if every != 1 and not called:
+            raise OptionError(f"run(every={every}): is for call=...; write(every=...) is for the recorded steps")
         progress_report = report.Progress(self.comm, quiet=not progress)
         progress_report.passed(first, self.time, end)
 
@@ -418,13 +420,14 @@ class Simulation:
         return dict(self.world.named["load"])
 
     def change(self, what: str, **values: Any) -> None:
-        """Give a load, spring, joint, source, large body or the cell other values from now on::
+        """Give a load, spring, joint, source, large body, pair of materials or the cell other values from now on::
 
             sim.change("load wind", force=(0, 0, -5.0))     # force, torque, start, end; with on=... it may begin
             sim.change("spring tie", length=0.5)            # stiffness, damping, length
             sim.change("joint boom", speed=-0.5)            # speed, target, strength, low, high
             sim.change("source rain", mass_rate=0.5)        # mass_rate or number_rate, 0 shuts it; velocity
             sim.change("body stirrer", speed=2.0)           # a parameter of its motion, motion=..., surface_velocity
+            sim.change("pair grains, steel", friction=0.2)  # restitution, rolling and others, where they act
             sim.change("cell", stress=(None, None, 2e3))    # stress, strain_rate, shear_rate of a periodic one
 
         The first rank's values count, and checkpoints keep them. ValueError for a name that is not there, and for what

@@ -1,4 +1,4 @@
-"""What a run changes of the world: parts, motions and surfaces of large bodies, and the cell.
+"""What a run changes of the world: parts, motions and surfaces of large bodies, laws of contact, and the cell.
 
 All ranks call these functions alike, with the same arguments. Checkpoints keep the changes.
 """
@@ -18,18 +18,20 @@ from dem.arrays import Floats
 from dem.checks import nearest
 from dem.model.world import World
 from dem.motion import Dynamic, Motion, Pose, Prescribed, checked_pose
+from dem.parts import contact_law
 from dem.parts.named import Named
 from dem.scene import KINDS, LargeBody, checked_surface
 
-CHANGED = (*KINDS, "body", "cell")  #: the kinds of what may be changed
+CHANGED = (*KINDS, "body", "pair", "cell")  #: the kinds of what may be changed
 
 
 def change(world: World, what: str, **values: Any) -> None:
     """Give a part other values from now on. ValueError for what is not there, and for values that it cannot have.
 
     `what` is a kind of `dem.scene.KINDS` and a name, such as "spring tie", with values of the class's `CHANGED`; "body
-    belt" with `motion`, or parameters of its present one, and `surface_velocity`; or "cell" with `shear_rate`, `stress`
-    and `strain_rate`. A part that is not there begins, if the class's `BEGINS` is among the values.
+    belt" with `motion`, or parameters of its present one, and `surface_velocity`; "pair grains, steel" of two materials
+    with coefficients of `dem.parts.contact_law.CHANGED`; or "cell" with `shear_rate`, `stress`, `strain_rate`. A part
+    that is not there begins, if the class's `BEGINS` is among the values.
     """
     kind, _, name = what.partition(" ")
     if kind not in CHANGED:
@@ -43,6 +45,8 @@ def change(world: World, what: str, **values: Any) -> None:
         grains.velocity = world.cell.taken_along(then, grains.position, grains.velocity)
     elif kind == "body":
         _change_body(world, name, **values)
+    elif kind == "pair":
+        _change_pair(world, name, **values)
     else:
         _change_part(world, kind, name, **values)
 
@@ -70,6 +74,22 @@ def _put(world: World, kind: str, name: str, part: Named) -> None:
     part.refuse(name, world)
     world.named[kind][name] = part
     world.changed.add((kind, name))
+
+
+def _change_pair(world: World, name: str, **values: float) -> None:
+    i, j = _pair(world, name)
+    _refuse_others(f"pair {name!r}", values, contact_law.CHANGED)
+    world.pairs = contact_law.changed(world.pairs, i, j, values)
+    world.changed.add(("pair", f"{world.materials[i]}, {world.materials[j]}"))
+
+
+def _pair(world: World, name: str) -> tuple[int, int]:
+    """The numbers of two materials that are named with a comma between them, the lower one first."""
+    numbers = range(len(world.materials))
+    found = [(i, j) for i in numbers for j in numbers if name == f"{world.materials[i]}, {world.materials[j]}"]
+    if not found:
+        raise ValueError(f"pair {name!r}: allowed are two, with a comma between, of {', '.join(world.materials)}")
+    return min(found[0]), max(found[0])
 
 
 # -- large bodies --------------------------------------------------------------------------------------------
@@ -138,6 +158,8 @@ def changes(world: World) -> str:
     for kind, name in sorted(world.changed):
         if kind == "body":
             entry = _entry(world.large_bodies[world.large_row(name)])
+        elif kind == "pair":
+            entry = contact_law.of_pair(world.pairs, *_pair(world, name))
         else:
             part = world.named[kind][name]
             entry = {key: getattr(part, key) for key in part.KEPT}
@@ -151,6 +173,9 @@ def restore(world: World, text: str) -> None:
         for name, entry in entries.items():
             if kind == "body":
                 world.replace_large(_restored(world.large_bodies[world.large_row(name)], entry))
+                continue
+            if kind == "pair":
+                _change_pair(world, name, **entry)
                 continue
             part: Any = world.named[kind].get(name)
             if part is None and not KINDS[kind].BEGINS:

@@ -103,6 +103,9 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
 
 LAWS = cast("tuple[type[Law], ...]", ContactLaw.__bases__)
 CHECKS = {each.name: each.metadata["check"] for each in fields(ContactLaw)}
+#: The coefficients that a run may change: no list of pairs, time step or spring depends on them.
+CHANGED = ("friction", "static_friction", "restitution", "rolling", "spinning", "rolling_coefficient",
+           "spinning_coefficient")  # fmt: skip
 
 
 def law(values: Mapping[str, float | None], before: ContactLaw | None = None) -> ContactLaw:
@@ -113,6 +116,25 @@ def law(values: Mapping[str, float | None], before: ContactLaw | None = None) ->
             raise ValueError(f"{name}: no such coefficient of contacts; {allowed}")
     given = {name: float(value) for name, value in values.items() if value is not None}
     return replace(before, **given) if before else ContactLaw(**given)
+
+
+def of_pair(both: ContactLaw, i: int, j: int) -> dict[str, float]:
+    """Return the coefficients of the materials i and j of tables that a run may change, by name."""
+    return {name: float(getattr(both, name)[i, j]) for name in CHANGED}
+
+
+def changed(both: ContactLaw, i: int, j: int, values: Mapping[str, float]) -> ContactLaw:
+    """Return tables with other coefficients, of `CHANGED`, of the materials i and j. ValueError for a bad one, and
+    where a law begins or ends to act: contacts would keep other numbers."""
+    law(values, ContactLaw(**{name: float(getattr(both, name)[i, j]) for name in CHECKS}))
+    tables = {name: getattr(both, name).copy() for name in values}
+    for name, table in tables.items():
+        table[i, j] = table[j, i] = values[name]
+    found = replace(both, **tables)
+    if found.acting != both.acting or found.bounces != both.bounces:
+        given = ", ".join(f"{name} {value:g}" for name, value in values.items())
+        raise ValueError(f"{given}: this law begins or ends to act, which is for the scene to say; allowed are others")
+    return found
 
 
 def tables(

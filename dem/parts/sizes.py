@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Union
 
 import numpy as np
 
@@ -48,6 +49,12 @@ class Listed:
         if len(self.shares) and not sum(self.shares) > 0.0:
             raise ValueError("shares of grains are all zero")
 
+    @classmethod
+    def by_mass(cls, values: Sequence[float], shares: Sequence[float]) -> Listed:
+        """The sizes of grains of one density and shape that have these shares of the mass, as sieves tell them."""
+        by_number = np.array(cls(values, shares).shares) / np.array(values, float) ** 3
+        return cls(values, tuple((by_number / by_number.sum()).tolist()))
+
     @property
     def ends(self) -> tuple[float, float]:
         """The least and the greatest size [m]."""
@@ -57,3 +64,13 @@ class Listed:
         """As of `Uniform`."""
         parts = np.cumsum(self.shares if len(self.shares) else np.ones(len(self.values)))
         return np.array(self.values)[np.searchsorted(parts / parts[-1], share, side="right")]
+
+
+Sizes = Union[Uniform, Listed]
+
+
+def sizes(given: float | Sequence[float] | Sizes) -> Sizes:
+    """A distribution, or that of one or several sizes alike. ValueError for a bad one."""
+    if isinstance(given, (Uniform, Listed)):
+        return given
+    return Listed(tuple(np.ravel(checks.positive("size of a grain", given)).tolist()))

@@ -18,7 +18,7 @@ from dem.bodies import SPHERE, Bodies, enclosing_radius
 from dem.geometry.region import Block, Cylinder, refuse_region
 from dem.motion import Timed
 from dem.parts.named import Named
-from dem.parts.sizes import Listed, Uniform
+from dem.parts.sizes import Listed, Sizes, Uniform, sizes
 from dem.shapes import Box, Capsule
 from dem.together import digest
 
@@ -34,7 +34,7 @@ class Source(Named, Timed):
     """
 
     region: Block | Cylinder  #: of the centres at birth
-    radius: float | Sequence[float] | Uniform | Listed  #: sizes; of spheres the radius [m]
+    radius: float | Sequence[float] | Sizes  #: sizes; of spheres the radius [m]
     density: float  #: [kg/m^3]
     mass_rate: float | None = None  #: [kg/s]; either this
     number_rate: float | None = None  #: [1/s]; or this
@@ -57,8 +57,7 @@ class Source(Named, Timed):
         given = [rate for rate in (self.mass_rate, self.number_rate) if rate is not None]
         checks.not_negative("rate of a source", given)
         checks.positive("density of a source", self.density)
-        if not isinstance(self.radius, (Uniform, Listed)):
-            object.__setattr__(self, "radius", Listed(tuple(np.atleast_1d(np.asarray(self.radius, float)).tolist())))
+        object.__setattr__(self, "radius", sizes(self.radius))
         if self.shape is not None and not isinstance(self.shape, (Box, Capsule)):
             raise ValueError(f"shape of a source: allowed is a Box or a Capsule, got {type(self.shape).__name__}")
         if not self.most >= 1:
@@ -66,7 +65,7 @@ class Source(Named, Timed):
         checks.check_fields(self, velocity=checks.vector)
 
     @property
-    def sizes(self) -> Uniform | Listed:
+    def sizes(self) -> Sizes:
         """The distribution of the sizes."""
         assert isinstance(self.radius, (Uniform, Listed))
         return self.radius

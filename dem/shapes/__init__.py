@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from typing import Any, Union, get_args
 
 import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
-from dem.bodies import BOX, CAPSULE, CONVEX, MESH, PLANE, SPHERE
+from dem.bodies import BOX, CAPSULE, CONVEX, MESH, PLANE, SPHERE, enclosing_radius
 from dem.checks import check_fields, finite, positive, rows, unit_quaternion, unit_vector, vector
 from dem.mesh import Mesh
 from dem.shapes.convex import Convex, centred
@@ -124,6 +125,19 @@ def placed(shape: Shape) -> tuple[int, Floats, Floats, Floats]:
     if isinstance(shape, Convex):
         return CONVEX, center, turn, centred(shape).size
     return MESH, center + quaternion.rotate(turn, shape.surface.middle), turn, shape.surface.half
+
+
+def outline(shape: Shape) -> tuple[Floats, Floats]:
+    """Return points (n, 3), and radii (n,) of balls about them, whose hull holds a shape in the frame of its body [m]:
+    the vertices of a mesh, the corners of a box, the ball about any other shape."""
+    kind, place, turn, size = placed(shape)
+    if isinstance(shape, Mesh):
+        point = place + quaternion.rotate(turn, shape.surface.vertex)
+    elif isinstance(shape, Box):
+        point = place + quaternion.rotate(turn, size * np.array(list(product((-1.0, 1.0), repeat=3))))
+    else:
+        return place[None], enclosing_radius(np.array([kind]), size[None])
+    return point, np.zeros(len(point))
 
 
 def solid(kind: int, size: Floats, density: Floats) -> tuple[Floats, Floats]:

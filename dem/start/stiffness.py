@@ -77,7 +77,7 @@ def recommended(scene: Scene) -> float:
     half = bodies.least_half_thickness(grains)
     allowed = OVERLAP * half
     with np.errstate(over="ignore", invalid="ignore"):  # inf: rigid
-        speeds = _fastest_point(scene), fastest_tool(scene)
+        speeds = _fastest_point(scene), fastest_tool(scene, about=True)
         thrown, pushed = (grains.mass * (speed / allowed) ** 2 for speed in speeds)
         needed = [_strongest(_load(scene, pressed) / allowed, thrown, pushed, STOPPED**2), pressed.force / allowed]
         needed += [_stopping(*impact, dt, FALLEN * half) for impact in _impacts(scene, pressed, dt)]
@@ -98,7 +98,7 @@ def expected_overlap(scene: Scene, stiffness: float, dt: float) -> float:
     if np.isinf(stiffness):
         return 0.0
     grains, pressed = scene.expected(), pressing(scene)
-    speeds = _fastest_point(scene), fastest_tool(scene)
+    speeds = _fastest_point(scene), fastest_tool(scene, about=True)
     thrown, pushed = (speed * np.sqrt(grains.mass / stiffness) for speed in speeds)
     half = bodies.least_half_thickness(grains)
     overlaps = [_strongest(_load(scene, pressed) / stiffness, thrown, pushed, STOPPED)]

@@ -11,13 +11,13 @@ import math
 
 import numpy as np
 
-from dem import bodies
+from dem import bodies, quaternion
 from dem.arrays import Floats
 from dem.contact.primitives import extents
-from dem.motion import top_speed
+from dem.motion import greatest_speed, top_speed
 from dem.parts.named import Pressing
 from dem.scene import LargeBody, Scene
-from dem.shapes import Plane
+from dem.shapes import Plane, outline
 from dem.start.falls import fall
 from dem.start.pressing import pressing
 from dem.start.toppling import toppling
@@ -101,9 +101,10 @@ def fastest(scene: Scene) -> float:
     return max(fastest_tool(scene), fastest_grain(scene))
 
 
-def fastest_tool(scene: Scene) -> float:
-    """Return the greatest speed of a large body that stays with the grains [m/s]."""
-    return max((_top_speed(body) for body in scene.large_bodies if body.name not in scene.leaving), default=0.0)
+def fastest_tool(scene: Scene, about: bool = False) -> float:
+    """Return the greatest speed of a large body that stays with the grains [m/s]; of the balls about their places
+    if `about`, by which the stiffness is chosen."""
+    return max((_top_speed(body, about) for body in scene.large_bodies if body.name not in scene.leaving), default=0.0)
 
 
 def fastest_grain(scene: Scene) -> float:
@@ -125,12 +126,17 @@ def _fall(scene: Scene) -> float:
     return float(np.sqrt(smallest(scene) / gravity)) if gravity > 0.0 else 0.1
 
 
-def _top_speed(body: LargeBody) -> float:
-    """The greatest speed of a point of a large body [m/s]; a plane has no end, and counts by the body's centre."""
-    parts = tuple(shape for shape in body.shapes if not isinstance(shape, Plane))
-    reach = float(extents([parts])[0]) if parts else 0.0
-    start = float(np.linalg.norm(body.velocity[:3]) + np.linalg.norm(body.velocity[3:]) * reach)
-    return max(start, top_speed(body.motion, body.position, reach))
+def _top_speed(body: LargeBody, about: bool) -> float:
+    """The greatest speed of a point of a large body [m/s], or of the ball `about` its place; a plane has no end, and
+    counts by the body's centre."""
+    shapes = tuple(shape for shape in body.shapes if not isinstance(shape, Plane))
+    parts = [(np.zeros((1, 3)), extents([shapes]) if shapes else np.zeros(1))]
+    if shapes and not about:
+        parts = [outline(shape) for shape in shapes]
+    point, radius = (np.concatenate(column) for column in zip(*parts))
+    point = body.position + quaternion.rotate(body.quaternion, point)
+    start = greatest_speed(body.velocity, body.position, point, radius)
+    return max(start, top_speed(body.motion, body.position, point, radius))
 
 
 def _rounded(seconds: float) -> float:

@@ -39,12 +39,13 @@ CHANGES = {
     "joint axle": {"target": 0.5, "strength": 3.0, "high": 2.0},
     "source rain": {"mass_rate": 2.0, "velocity": (0, 0, -1)},
     "body belt": {"motion": Glide((1, 0, 0)), "surface_velocity": (0, 1, 0)},
+    "pair default, default": {"friction": 0.7},
 }
 
 
 def all_of(world):
     parts = [*world.named.values(), {b.name: b for b in world.large_bodies}]
-    return repr([vars(part) for named in parts for part in named.values()])
+    return repr([vars(part) for named in parts for part in named.values()] + [world.pairs])
 
 
 def test_what_is_changed_is_kept_and_restored():
@@ -64,6 +65,7 @@ def test_what_is_changed_is_kept_and_restored():
     for kind in ("spring", "joint", "source"):
         assert again.named[kind] == world.named[kind]
     assert again.large_bodies[1].motion == Glide((1, 0, 0))
+    assert again.pairs.friction == world.pairs.friction == 0.7
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,9 @@ REFUSED = {
     "body blt": ({"motion": Glide((1, 0, 0))}, "no large body 'blt'; there are: arm, belt; did you mean belt"),
     "body arm": ({"motion": Glide((1, 0, 0))}, "cannot change its motion"),
     "body belt": ({"motion": Glide((1, 0, 0)), "velocity": (1, 0, 0)}, "a motion, or parameters of the present one"),
+    "pair default": ({"friction": 0.1}, "pair 'default': allowed are two, with a comma between, of default"),
+    "pair default, default": ({"friction": -0.1}, "friction must not be negative"),
+    "pair default, default ": ({"friction": 0.1}, "allowed are two, with a comma"),
     "cell": ({"stres": (None, None, 1.0)}, "cell: stres cannot be set; .* did you mean stress"),
     "cell ": ({"stress": (None, None, 1.0)}, "stress: the periods of this cell are constant"),
 }
@@ -101,6 +106,22 @@ def test_what_cannot_be_is_refused_and_changes_nothing(what):
     with pytest.raises(ValueError, match=words):
         change(world, what, **values)
     assert all_of(world) == before
+    assert not world.changed
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"stiffness": 1e5}, "stiffness cannot be set; allowed are friction, .*rolling"),
+        ({"rolling": 0.01}, "rolling 0.01: this law begins or ends to act"),
+        ({"restitution": 0.5}, "restitution 0.5: this law begins or ends to act"),
+        ({"friction": 0.1, "restitution": 2.0}, "restitution must be"),
+    ],
+)
+def test_laws_of_contact_do_not_begin_within_a_run(values, words):
+    world = wired()
+    with pytest.raises(ValueError, match=words):
+        change(world, "pair default, default", **values)
     assert not world.changed
 
 

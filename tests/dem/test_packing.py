@@ -48,11 +48,25 @@ def test_sizes_of_a_packing_have_their_shares():
     assert (radius == 0.06).mean() == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / len(radius)))
 
 
+def test_shares_of_a_sieve_curve_are_those_of_the_mass():
+    sizes = Listed.by_mass((0.03, 0.06), (1, 3))
+    assert sizes.shares == pytest.approx((8 / 11, 3 / 11))
+    radius = random_packing((1, 1, 1), Listed.by_mass((0.02, 0.04), (1, 1)), 0.3, seed=1)[1]
+    assert (radius == 0.02).mean() == pytest.approx(8 / 9, abs=4 * np.sqrt(8 / 81 / len(radius)))
+
+
+def test_several_sizes_of_a_packing_are_alike():
+    radius = random_packing((1, 1, 1), [0.03, 0.06], 0.3, seed=1)[1]
+    assert (radius == 0.06).mean() == pytest.approx(0.5, abs=4 * np.sqrt(0.25 / len(radius)))
+
+
 def test_what_cannot_be_packed_is_refused():
     with pytest.raises(ValueError, match="take a lower solid fraction"):
         random_packing((1, 1, 1), 0.12, 0.73, periodic=(True, True, True), most=200)
     with pytest.raises(ValueError, match="do not fit into a box"):
         random_packing((1, 0.1, 1), 0.1, 0.1)
+    with pytest.raises(ValueError, match="size of a grain"):
+        random_packing((1, 1, 1), [0.1, -0.1], 0.3)
     with pytest.raises(ValueError, match="between 0 and 0.74"):
         random_packing((1, 1, 1), 0.1, 0.8)
 

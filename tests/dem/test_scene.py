@@ -10,7 +10,8 @@ from mpi4py import MPI
 
 from dem.arrays import Rule
 from dem.bodies import bounding_radius
-from dem.motion import Dynamic, Glide, Guided, Hinged, Oscillation, Path, Rotation
+from dem.mesh import Mesh
+from dem.motion import Dynamic, Glide, Guided, Held, Hinged, Oscillation, Path, Rotation
 from dem.packing import perturbed
 from dem.scene import Scene
 from dem.shapes import Box, Plane, Sphere
@@ -137,6 +138,35 @@ def test_the_survey_is_that_of_all_grains(monkeypatch):
     np.testing.assert_allclose(found.spread, 300 * np.cov(grains.position.T, bias=True), rtol=1e-12)
     assert fastest(scene) == pytest.approx(np.linalg.norm(grains.velocity[:, :3], axis=1).max(), rel=1e-12)
     assert smallest(scene) == grains.size[:, 0].min()
+
+
+LONG = [Box((1.0, 0.1, 0.1)), Sphere(0.2, (1.5, 0, 0))]
+MESH = [Mesh([(0, 0.05, 0), (1, 0, 0.05), (2, -0.05, 0)], [(0, 1, 2)])]
+
+
+@pytest.mark.parametrize(
+    ("shapes", "motion", "most"),
+    [
+        (LONG, Rotation((2.0, 0, 0)), 0.4),  # a long tool about its axis: the ball beside the box
+        (LONG, Rotation((2.0, 0, 0), center=(0, 0.3, 0)), 1.0),
+        (LONG, Rotation((0, 2.0, 0)), 3.4),
+        (LONG, Hinged((1, 0, 0), torque=1.0, speed=-2.0), 0.4),
+        (LONG, Held((3.0, None, None), (2.0, 0, 0)), 3.4),
+        (MESH, Rotation((2.0, 0, 0)), 0.1),
+        (MESH, Rotation((0, 0, 2.0)), 2 * np.hypot(2.0, 0.05)),
+        (LONG, Glide((0, 3.0, 4.0)), 5.0),
+        (LONG, Path([0, 1, 1.5], [(0, 0, 0), (1, 0, 0), (1, 2, 0)]), 4.0),
+        (LONG, Oscillation((0, 0, 1), 0.5, 2.0), 0.5 * np.pi),
+        (LONG, Guided((0, 0, 1), force=1.0, speed=-0.5), 0.5),
+    ],
+)
+def test_a_tool_is_as_fast_as_its_fastest_point(shapes, motion, most):
+    """So a screw or a drum that turns about its long axis asks for no smaller steps than a short one."""
+    scene = Scene(0.3)
+    inertia = {"mass": 1.0, "inertia": (1.0, 1.0, 1.0)} if isinstance(motion, Dynamic) else {}
+    scene.add_body("tool", shapes, motion, **inertia)
+    scene.add_spheres(UP, 0.1, 1000.0)
+    assert fastest(scene) == pytest.approx(most, rel=1e-9)
 
 
 def test_a_scene_of_the_package_takes_no_memory_for_its_grains(monkeypatch):

@@ -106,7 +106,10 @@ def test_materials_have_a_legend_with_their_names(render, tmp_path):
     ("colour", "values", "ends"),
     [
         ("speed", [*np.linspace(0.0, 1.9, 1000), 500.0], (0.0, 2.0)),  # an outlier does not leave the others in one
-        ("size", [0.1, 0.2, 0.4], (0.1, 0.4)),
+        ("size", [0.1, 0.2, 0.5], (0.1, 0.5)),
+        ("size", [0.0080251, 0.0159742], (0.008, 0.016)),  # 0.0080251 has no room beside the bar
+        ("size", [0.0119, 0.0121, 0.0125], (0.0118, 0.0126)),
+        ("size", [9.9, 10.1], (9.9, 10.1)),
         ("size", [0.2, 0.2], (0.0, 0.2)),
         ("force", [0.0, 0.0], (0.0, 1.0)),
         ("material", [0, 1, 2], (0.0, 2.0)),
@@ -114,7 +117,7 @@ def test_materials_have_a_legend_with_their_names(render, tmp_path):
     ],
 )
 def test_ends_of_the_colours(colour, values, ends):
-    assert program.ends_of(colour, np.array(values, dtype=float)) == ends
+    assert program.ends_of(colour, np.array(values, dtype=float)) == pytest.approx(ends, rel=1e-12)
 
 
 def test_bodies_have_the_colours_that_are_given():

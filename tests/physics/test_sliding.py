@@ -5,6 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from drive import HALF, SOLVERS, G, block, make_steps, on_incline, steps
+from mpi4py import MPI
+
+from dem.scene import Scene
+from dem.shapes import Plane
+from pctt.simulation import Simulation
 
 MU = 0.3
 
@@ -57,3 +62,21 @@ def test_a_sliding_block_comes_to_rest_after_its_braking_distance(solver, flush)
         errors.append(distance - world.grains.position[0, 0])
         assert errors[-1] == pytest.approx(dt * start / 2, rel=0.02)
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.02)
+
+
+def test_a_block_slides_when_its_friction_is_made_less_and_a_checkpoint_keeps_it(tmp_path):
+    """mu = 0.5 holds it at 20 degrees; with 0.1 it goes down with g (sin - mu cos)."""
+    tilt = np.radians(20)
+    scene = Scene(0.9, gravity=9.81 * np.array([np.sin(tilt), 0, -np.cos(tilt)]))
+    scene.set_pair("stone, wet", "steel", friction=0.5)
+    scene.add_body("floor", [Plane((0, 0, 1))], material="steel")
+    scene.add_boxes([0, 0, 0.1], (0.2, 0.2, 0.1), 1000.0, material="stone, wet")
+    sim = Simulation(scene, dt=0.01, tol=1e-8, comm=MPI.COMM_SELF)
+    sim.run(steps=20)
+    assert abs(sim.velocities[0, 0]) < 1e-6
+    sim.change("pair steel, stone, wet", friction=0.1)
+    sim.run(steps=10)
+    sim.save(tmp_path / "slides.h5")
+    with Simulation.load(tmp_path / "slides.h5", scene, dt=0.01, tol=1e-8, comm=MPI.COMM_SELF) as again:
+        again.run(steps=10)
+        assert again.velocities[0, 0] == pytest.approx(0.2 * 9.81 * (np.sin(tilt) - 0.1 * np.cos(tilt)), rel=1e-5)

@@ -79,6 +79,8 @@ def test_a_time_that_is_past_is_no_end():
     for every in (0, -1, 2.5):
         with pytest.raises(OptionError, match=rf"run\(every={every}\): allowed are whole numbers from 1 on"):
             sim.run(steps=1, every=every)
+    with pytest.raises(OptionError, match=r"run\(every=10\): is for call=...; write\(every=...\) is for the recorded"):
+        sim.run(steps=1, every=10)
     assert sim.steps == 7
 
 
