@@ -184,7 +184,10 @@ class ContactMap:
             self._sum_forces(self._m)
         else:
             self._add_through(weight)
-        np.add(v, self.mass.momenta(self._m, np.zeros(self.mass.axes)), out=out.reshape(-1, 6))
+        if self.couples:
+            np.add(v, self.mass.momenta(self._m, np.zeros(self.mass.axes)), out=out.reshape(-1, 6))
+        else:
+            loops.add_scaled(self.mass.root, v, self._m, out.reshape(-1, 6))
         self.log_flops(72 * self.rows + 18 * self.columns)
 
     def _add_through(self, weight: Floats) -> None:
