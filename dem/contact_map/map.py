@@ -193,6 +193,9 @@ class ContactMap:
     def _add_through(self, weight: Floats) -> None:
         """The momenta G' H G v, not yet scaled by masses, of the velocities that are on their way."""
         self._m[:] = 0.0
+        if not self.halo.talks:
+            self._add(loops.add_through, self._own, weight, self._w, self._m)
+            return
         half, rest, away = self._pieces
         self._add(loops.add_through, half, weight, self._w, self._m)
         self.halo.end_update(self._w)

@@ -56,7 +56,8 @@ class Conic:
     with which a contact next to the boundary has no room to turn."""
 
     start: float = number(30.0, "complementarity of the start [mean(r^2) / mean diag N]; below 1 steps are short")
-    forcing: float = number(0.3, "residual of a linear solve [velocity that the natural residual shows]; 1: 2x steps")
+    forcing: float = number(0.8, "residual of a linear solve [velocity that the natural residual shows]; 1: 2x steps")
+    last: float = number(0.5, "of the limit")
     forcing_with_law: float = number(0.03, "the same; with 0.3 it stalls at 1e-4")
     forcing_of_impulses: float = number(0.003, "the same in the form `contact`, where no step mends it; 0.3: it stalls")
     boundary: float = number(0.99, "part of the way to the cone's boundary that a step may go")
@@ -77,7 +78,7 @@ def solve(
     if coulomb and not newton.linear.takes_unsymmetric:
         words = "Coulomb's law needs the Newton form body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
-    conic = ConicProblem(problem, options, coulomb, newton.system.error_in_momenta)
+    conic = ConicProblem(problem, options, coulomb, newton.system.error_in_momenta, limits.aimed)
     at, history, waited, least, last_gap = conic.start(guess), list[float](), 0, np.inf, np.inf
     while True:
         # residuals
@@ -139,6 +140,7 @@ class Residuals(NamedTuple):
     g: Array
     y: Array
     errors: Errors
+    exact: float
     r_v: Array
     r_y: Array
 
@@ -162,8 +164,9 @@ class ConicProblem:
     within : (count, width) the same but for the problem's own C
     """
 
-    def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool, error_in_momenta: bool):
+    def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool, error_in_momenta: bool, aimed: float):
         self.problem, self.options, self.coulomb, self.error_in_momenta = problem, options, coulomb, error_in_momenta
+        self.aimed = aimed
         self.form = problem.cones.lorentz()
         self.count = problem.size * self.form.number  # of Lorentz cones on all ranks
         self.proximal = options.proximal * problem.mean_diagonal
@@ -199,8 +202,10 @@ class ConicProblem:
         rest = problem.compliance * g + problem.r
         y = (problem.velocity_of(momentum) + rest) * form.mask
         r_y = (problem.velocity_of(at.v) + rest) * form.mask
-        r_y -= form.transpose(without_de_saxce(at.z) if self.coulomb else at.z)
-        return Residuals(g, y, problem.errors(g, y, self.coulomb), at.v - momentum, r_y)
+        dual = form.transpose(without_de_saxce(at.z) if self.coulomb else at.z)
+        r_y -= dual
+        exact = problem.errors(g, dual, self.coulomb).natural
+        return Residuals(g, y, problem.errors(g, y, self.coulomb), exact, at.v - momentum, r_y)
 
     def linearised(self, at: Point, found: Residuals) -> Linearised:
         """The linear equations of an iterate."""
@@ -209,7 +214,8 @@ class ConicProblem:
             u = sliding_directions(at.z) if self.coulomb else self._still
             arrow = self.form.arrow(*W, u, self.compliance, self.tangential) if self.error_in_momenta else None
         # the velocities that the natural residual stands for
-        shown = found.errors.natural * self.problem.norm(found.g) * self.problem.mean_diagonal
+        natural = min(found.errors.natural, max(found.exact, self.options.last / self.forcing * self.aimed))
+        shown = natural * self.problem.norm(found.g) * self.problem.mean_diagonal
         return Linearised(self, at, found, W, u, arrow, self.forcing * shown)
 
     def moved(self, at: Point, d: Direction, step: float) -> Point:
@@ -245,15 +251,16 @@ class Linearised(NamedTuple):
     def direction(self, newton: Newton, w: Array, *earlier: Array) -> Direction:
         """The direction of the right-hand side w; ``earlier``: solutions of the Newton system to begin from."""
         problem, form, found = self.conic.problem, self.conic.form, self.found
-        c, f = lorentz.right_hand_sides(*self.W, self.at.s, self.at.z, self.u, w)
-        q = form.transpose(c) - found.r_y
-        uncoupled = None if self.arrow is None else self.arrow.uncoupled(f, found.r_y)
-        dg, x = newton.solve(q, self.tol, found.r_v, earlier, uncoupled)
-        dv, ds = newton.system.momenta(x, dg, found.r_v), form.apply(dg)
         if self.arrow is not None:  # r_y vanishes, r_v takes the error of the linear solve
-            dy = problem.velocity_of(dv) + problem.compliance * dg + found.r_y
+            f = lorentz.uncoupled_changes(*self.W, self.at.s, w)
+            dg, x = newton.solve(None, self.tol, found.r_v, earlier, self.arrow.uncoupled(f, found.r_y))
+            dv, ds = newton.system.momenta(x, dg, found.r_v), form.apply(dg)
+            dy = newton.system.velocity + problem.compliance * dg + found.r_y
             dy = self.arrow.dual_step(dy, f, ds)
         else:  # r_v vanishes, r_y takes it
+            c = lorentz.right_hand_sides(*self.W, self.at.z, self.u, w)
+            dg, x = newton.solve(form.transpose(c) - found.r_y, self.tol, found.r_v, earlier)
+            dv, ds = newton.system.momenta(x, dg, found.r_v), form.apply(dg)
             dy = lorentz.subtract_inverse_squared(*self.W, self.u, c, ds)
         return Direction(ds, self._turned(dy), dy, dv, x)
 

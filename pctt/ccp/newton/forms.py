@@ -192,7 +192,11 @@ class BodyForm(Form):
     system and far better conditioned once contacts open or slide.
 
     For Coulomb's law (B + C)^-1 is not symmetric, and K is not either. With moments its blocks are (nc, 6, 6).
+
+    velocity : G dv (rows, 3) of the last `impulses`
     """
+
+    velocity: Array
 
     error_in_momenta = True
 
@@ -252,16 +256,18 @@ class BodyForm(Form):
     def speed(self) -> float:
         return float(self.problem.mean_diagonal**0.5)
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
-        times = self.problem.cones.times
-        push = self.problem.momentum(times(self._inverse, q) if uncoupled is None else uncoupled)
+    def right_hand_side(self, q: Array | None, r_v: Array | None, uncoupled: Array | None) -> Array:
+        if uncoupled is None:
+            assert q is not None
+            uncoupled = self.problem.cones.times(self._inverse, q)
+        push = self.problem.momentum(uncoupled)
         return push if r_v is None else push - r_v
 
-    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
-        times = self.problem.cones.times
+    def impulses(self, x: Array, q: Array | None, uncoupled: Array | None) -> Array:
+        times, self.velocity = self.problem.cones.times, self.problem.velocity_of(x)
         if uncoupled is None:
-            return times(self._inverse, q - self.problem.velocity_of(x))
-        return uncoupled - times(self._inverse, self.problem.velocity_of(x))
+            return times(self._inverse, q - self.velocity)
+        return uncoupled - times(self._inverse, self.velocity)
 
     def momenta(self, x: Array, dg: Array, r_v: Array) -> Array:
         return x
