@@ -80,6 +80,7 @@ def solve(
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
     conic = ConicProblem(problem, options, coulomb, newton.system.error_in_momenta, limits.aimed)
     at, history, waited, least, last_gap = conic.start(guess), list[float](), 0, np.inf, np.inf
+    recent: tuple[Array, ...] = ()
     while True:
         # residuals
         found, gap = conic.residuals(at), problem.dot(at.s, at.z)
@@ -99,7 +100,7 @@ def solve(
         newton.update(*linear.blocks(), symmetric=not coulomb)
         # affine step
         with phase("ConicPredictor"):
-            affine = linear.direction(newton, np.zeros(at.z.shape))
+            affine = linear.direction(newton, np.zeros(at.z.shape), *recent)
         # centring: the further the affine step may go, the less (Mehrotra)
         target = max((1.0 - min(1.0, linear.reach(affine))) ** 3, options.least) * gap / conic.count
         with phase("ConicCorrector"):
@@ -112,6 +113,7 @@ def solve(
                 w += linear.gondzio_correction(direction, min(1.0, step + options.reach), target)
                 other = linear.direction(newton, w, direction.x)
                 step, direction = max((step, direction), (linear.step(other), other), key=lambda pair: pair[0])
+        recent = affine.x, direction.x
         # update
         if step > 0:
             at = conic.moved(at, direction, step)
