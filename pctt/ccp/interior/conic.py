@@ -47,6 +47,7 @@ from pctt.options import number
 if TYPE_CHECKING:
     from pctt.ccp.newton import Newton
 
+LARGE = 100.0  # of the impulses that the data suggest: smaller ones of an unbounded problem are far from the tolerance
 LESS, HALF = 0.9, 0.5  # of the least residual, and of the last complementarity, that count as progress
 
 
@@ -86,7 +87,8 @@ def solve(
         found, gap = conic.residuals(at), problem.dot(at.s, at.z)
         history.append(limits.residual(found.errors))
         limits.report(len(history) - 1, history[-1])
-        unbounded = bool(why_unbounded(given, found.g, found.y))
+        large = problem.norm(found.g) > LARGE * problem.norm(problem.r) / problem.mean_diagonal
+        unbounded = large and bool(why_unbounded(given, found.g, found.y))
         if unbounded or history[-1] == min(history):
             best = found.g
         progress = found.errors.natural <= LESS * least or gap <= HALF * last_gap
@@ -206,8 +208,9 @@ class ConicProblem:
         r_y = (problem.velocity_of(at.v) + rest) * form.mask
         dual = form.transpose(without_de_saxce(at.z) if self.coulomb else at.z)
         r_y -= dual
-        exact = problem.errors(g, dual, self.coulomb).natural
-        return Residuals(g, y, problem.errors(g, y, self.coulomb), exact, at.v - momentum, r_y)
+        errors = problem.errors(g, y, self.coulomb)
+        exact = problem.errors(g, dual, self.coulomb).natural if self.error_in_momenta else errors.natural
+        return Residuals(g, y, errors, exact, at.v - momentum, r_y)
 
     def linearised(self, at: Point, found: Residuals) -> Linearised:
         """The linear equations of an iterate."""

@@ -19,7 +19,7 @@ from pctt.petsc import options_database
 if TYPE_CHECKING:
     from pctt.ccp.newton.forms import System
 
-LIMIT = 4.0  # iterations with block Jacobi at most, in units of the easy ones
+LIMIT = 2.0  # iterations with block Jacobi at most, in units of the easy ones
 ALONE = 20_000  # the same where the memory has no room for a factor
 
 
@@ -44,7 +44,7 @@ class ByFactors(Iterative):
         super().factor(system)
         self._own.renew()
         self._easy = easy_iterations(self.comm, system)
-        self._hard = self._most > self._easy
+        self._hard = self._hard or self._most > self._easy
 
     def solve(self, b: Array, wanted: float, earlier: Sequence[Array]) -> Array:
         x, rtol = self.start(b, wanted, earlier)
