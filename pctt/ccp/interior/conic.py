@@ -57,8 +57,7 @@ class Conic:
     with which a contact next to the boundary has no room to turn."""
 
     start: float = number(30.0, "complementarity of the start [mean(r^2) / mean diag N]; below 1 steps are short")
-    forcing: float = number(0.8, "residual of a linear solve [velocity that the natural residual shows]; 1: 2x steps")
-    last: float = number(0.5, "of the limit")
+    forcing: float = number(0.5, "residual of a linear solve [velocity that the residual without such errors shows]")
     forcing_with_law: float = number(0.03, "the same; with 0.3 it stalls at 1e-4")
     forcing_of_impulses: float = number(0.003, "the same in the form `contact`, where no step mends it; 0.3: it stalls")
     boundary: float = number(0.99, "part of the way to the cone's boundary that a step may go")
@@ -138,8 +137,9 @@ class Point(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Of an iterate: its impulses and their velocities y = N g + r (rows, 3), their errors, v - G' g, and
-    y - A'z with the y of v, z without De Saxce's term."""
+    """Of an iterate: its impulses and their velocities y = N g + r (rows, 3), their errors, the natural residual with
+    A'z in the place of y (that of exact linear solves), v - G' g, and y - A'z with the y of v, z without De Saxce's
+    term."""
 
     g: Array
     y: Array
@@ -166,6 +166,7 @@ class ConicProblem:
     error_in_momenta : whether the error of an inexact solve is one of momenta, which the next step mends
     compliance, tangential : (count,), and of all cones (k count,), the parts of C within a step
     within : (count, width) the same but for the problem's own C
+    aimed : the natural residual to go on to
     """
 
     def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool, error_in_momenta: bool, aimed: float):
@@ -218,8 +219,9 @@ class ConicProblem:
             W = NesterovTodd(*lorentz.scaling(at.s, at.z))
             u = sliding_directions(at.z) if self.coulomb else self._still
             arrow = self.form.arrow(*W, u, self.compliance, self.tangential) if self.error_in_momenta else None
-        # the velocities that the natural residual stands for
-        natural = min(found.errors.natural, max(found.exact, self.options.last / self.forcing * self.aimed))
+        # the velocities that the natural residual stands for, or what exact solves would have left of it: if they have
+        # left less errors of solves are all there is, and each would be made smaller by the forcing alone
+        natural = min(found.errors.natural, max(found.exact, self.aimed))
         shown = natural * self.problem.norm(found.g) * self.problem.mean_diagonal
         return Linearised(self, at, found, W, u, arrow, self.forcing * shown)
 

@@ -30,7 +30,8 @@ class ConjugateGradients:
     def solve(self, A: PETSc.Mat, b: PETSc.Vec, x: PETSc.Vec, rtol: float, most: int) -> Solve:
         """x = A^-1 b from zero, in at most so many iterations."""
         shell = shell_of(A)
-        assert shell is not None and shell.blocks is not None
+        assert shell is not None
+        assert shell.blocks is not None
         if self._inverse is None:
             self._inverse = np.empty((len(shell.blocks), 21), np.float32)
             _invert(shell.blocks, self._inverse)

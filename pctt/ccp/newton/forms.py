@@ -44,6 +44,7 @@ class Form:
     update: Callable[..., None]
     right_hand_side: Callable[..., Array]
     impulses: Callable[..., Array]
+    velocity: Array  #: G dv (rows, 3) of the last `impulses`, where these have come from momenta
 
     def fits(self, kkt: KKT) -> bool:
         """Whether the matrix can take the values of these constraints."""
@@ -141,11 +142,12 @@ class ContactForm(Form):
             self.problem.N.copy(old, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         return old
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
+    def right_hand_side(self, q: Array | None, r_v: Array | None, uncoupled: Array | None) -> Array:
         """Of the system for x. ``uncoupled`` is (B + C)^-1 q, if the caller has it more accurately."""
+        assert q is not None
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
 
-    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
+    def impulses(self, x: Array, q: Array | None, uncoupled: Array | None) -> Array:
         """dg (nc, 3) of a solution."""
         return x.reshape(-1, 3).copy()
 
@@ -178,7 +180,8 @@ class GivenForm(ContactForm):
     def N(self) -> sp.bsr_matrix:  # noqa: N802 - as in formulas
         return self.problem.operator.local  # type: ignore[union-attr]
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
+    def right_hand_side(self, q: Array | None, r_v: Array | None, uncoupled: Array | None) -> Array:
+        assert q is not None
         return q.ravel()
 
 
@@ -192,11 +195,7 @@ class BodyForm(Form):
     system and far better conditioned once contacts open or slide.
 
     For Coulomb's law (B + C)^-1 is not symmetric, and K is not either. With moments its blocks are (nc, 6, 6).
-
-    velocity : G dv (rows, 3) of the last `impulses`
     """
-
-    velocity: Array
 
     error_in_momenta = True
 
@@ -266,6 +265,7 @@ class BodyForm(Form):
     def impulses(self, x: Array, q: Array | None, uncoupled: Array | None) -> Array:
         times, self.velocity = self.problem.cones.times, self.problem.velocity_of(x)
         if uncoupled is None:
+            assert q is not None
             return times(self._inverse, q - self.velocity)
         return uncoupled - times(self._inverse, self.velocity)
 
