@@ -57,7 +57,7 @@ class Conic:
     with which a contact next to the boundary has no room to turn."""
 
     start: float = number(30.0, "complementarity of the start [mean(r^2) / mean diag N]; below 1 steps are short")
-    forcing: float = number(0.5, "residual of a linear solve [velocity that the residual without such errors shows]")
+    forcing: float = number(0.3, "residual of a linear solve [velocity that the natural residual shows]; 1: 2x steps")
     forcing_with_law: float = number(0.03, "the same; with 0.3 it stalls at 1e-4")
     forcing_of_impulses: float = number(0.003, "the same in the form `contact`, where no step mends it; 0.3: it stalls")
     boundary: float = number(0.99, "part of the way to the cone's boundary that a step may go")
@@ -78,9 +78,9 @@ def solve(
     if coulomb and not newton.linear.takes_unsymmetric:
         words = "Coulomb's law needs the Newton form body and its own linear solver"
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
-    conic = ConicProblem(problem, options, coulomb, newton.system.error_in_momenta, limits.aimed)
+    conic = ConicProblem(problem, options, coulomb, newton.system.error_in_momenta)
     at, history, waited, least, last_gap = conic.start(guess), list[float](), 0, np.inf, np.inf
-    recent: tuple[Array, ...] = ()
+    recent: tuple[Array, ...] = ()  # solutions of the last step: those of this one are alike
     while True:
         # residuals
         found, gap = conic.residuals(at), problem.dot(at.s, at.z)
@@ -114,10 +114,9 @@ def solve(
                 w += linear.gondzio_correction(direction, min(1.0, step + options.reach), target)
                 other = linear.direction(newton, w, direction.x)
                 step, direction = max((step, direction), (linear.step(other), other), key=lambda pair: pair[0])
-        recent = affine.x, direction.x
         # update
         if step > 0:
-            at = conic.moved(at, direction, step)
+            at, recent = conic.moved(at, direction, step), (affine.x, direction.x)
     iterations = len(history) - 1
     status, words = Status.STALLED, f"stalled after {iterations} iterations"
     if min(history) <= limits.tol:
@@ -137,14 +136,12 @@ class Point(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Of an iterate: its impulses and their velocities y = N g + r (rows, 3), their errors, the natural residual with
-    A'z in the place of y (that of exact linear solves), v - G' g, and y - A'z with the y of v, z without De Saxce's
-    term."""
+    """Of an iterate: its impulses and their velocities y = N g + r (rows, 3), their errors, v - G' g, and
+    y - A'z with the y of v, z without De Saxce's term."""
 
     g: Array
     y: Array
     errors: Errors
-    exact: float
     r_v: Array
     r_y: Array
 
@@ -166,12 +163,10 @@ class ConicProblem:
     error_in_momenta : whether the error of an inexact solve is one of momenta, which the next step mends
     compliance, tangential : (count,), and of all cones (k count,), the parts of C within a step
     within : (count, width) the same but for the problem's own C
-    aimed : the natural residual to go on to
     """
 
-    def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool, error_in_momenta: bool, aimed: float):
+    def __init__(self, problem: ConeProblem, options: Conic, coulomb: bool, error_in_momenta: bool):
         self.problem, self.options, self.coulomb, self.error_in_momenta = problem, options, coulomb, error_in_momenta
-        self.aimed = aimed
         self.form = problem.cones.lorentz()
         self.count = problem.size * self.form.number  # of Lorentz cones on all ranks
         self.proximal = options.proximal * problem.mean_diagonal
@@ -207,11 +202,8 @@ class ConicProblem:
         rest = problem.compliance * g + problem.r
         y = (problem.velocity_of(momentum) + rest) * form.mask
         r_y = (problem.velocity_of(at.v) + rest) * form.mask
-        dual = form.transpose(without_de_saxce(at.z) if self.coulomb else at.z)
-        r_y -= dual
-        errors = problem.errors(g, y, self.coulomb)
-        exact = problem.errors(g, dual, self.coulomb).natural if self.error_in_momenta else errors.natural
-        return Residuals(g, y, errors, exact, at.v - momentum, r_y)
+        r_y -= form.transpose(without_de_saxce(at.z) if self.coulomb else at.z)
+        return Residuals(g, y, problem.errors(g, y, self.coulomb), at.v - momentum, r_y)
 
     def linearised(self, at: Point, found: Residuals) -> Linearised:
         """The linear equations of an iterate."""
@@ -219,10 +211,8 @@ class ConicProblem:
             W = NesterovTodd(*lorentz.scaling(at.s, at.z))
             u = sliding_directions(at.z) if self.coulomb else self._still
             arrow = self.form.arrow(*W, u, self.compliance, self.tangential) if self.error_in_momenta else None
-        # the velocities that the natural residual stands for, or what exact solves would have left of it: if they have
-        # left less errors of solves are all there is, and each would be made smaller by the forcing alone
-        natural = min(found.errors.natural, max(found.exact, self.aimed))
-        shown = natural * self.problem.norm(found.g) * self.problem.mean_diagonal
+        # the velocities that the natural residual stands for
+        shown = found.errors.natural * self.problem.norm(found.g) * self.problem.mean_diagonal
         return Linearised(self, at, found, W, u, arrow, self.forcing * shown)
 
     def moved(self, at: Point, d: Direction, step: float) -> Point:
