@@ -11,7 +11,7 @@ from problems import SELF, Known, from_graph, from_matrix, heap, known_optimum, 
 from dem.contact_map import BlockRows
 from pctt import ccp, memory
 from pctt.ccp import ConeProblem, Limits, Newton, newton_for
-from pctt.ccp.interior import conic
+from pctt.ccp.interior.conic import Conic
 from pctt.ccp.newton import by_elimination
 from pctt.ccp.newton import factor as factor_of
 from pctt.ccp.newton.conjugate_gradients import ConjugateGradients
@@ -137,10 +137,9 @@ def test_linear_solves_begin_from_those_of_the_last_step(monkeypatch):
 
     once = Newton.solve
     monkeypatch.setattr(Newton, "solve", solved)
-    monkeypatch.setattr(conic.Linearised, "step", lambda linear, d: 0.8 * linear.reach(d) and 0.8)
     G, r, mu = packing()
-    limits = Limits(1e-10, 3, fallback=False)
-    ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", limits, law=ccp.RELAXATION)
+    limits, two = Limits(1e-10, 3, fallback=False), Conic(short=0.0)  # directions in each step
+    ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", limits, two, law=ccp.RELAXATION)
     assert begun == [[], [0], [0, 1], [2], [2, 3], [4]]
 
 
