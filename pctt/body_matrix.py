@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.compiled import loop
 from dem.contact_map import BlockRows, ContactMap
 from dem.exchange import exchange, offsets
 from pctt.blocks import Array, new_matrix, set_diagonal_blocks, symmetric_shell
@@ -109,37 +109,30 @@ class BodyMatrix:
 
     def load(self, G: BlockRows) -> None:
         """Take a G of the same structure."""
-        self.G = G
-        if len(self.bodies):
-            self._rows = sp.bsr_matrix((G.blocks, self._column, G.indptr), shape=(3 * G.rows, 6 * len(self.bodies)))
-            self._columns = self._rows.T.tobsr()
+        self.G, self._blocks = G, np.ascontiguousarray(G.blocks)
 
-    def _product(self, inverse: Array) -> sp.bsr_matrix:
-        """G' H G of the contacts and bodies of this rank, for the blocks H (nc, 3 parts, 3 parts)."""
-        count, parts = len(inverse), self._parts
-        if len(self.bodies) == 0:
-            return sp.bsr_matrix((0, 0), blocksize=(6, 6))
-        blocks = inverse.reshape(count, parts, 3, parts, 3).transpose(1, 0, 3, 2, 4).reshape(-1, 3, 3)
-        column = np.tile((np.arange(count)[:, None] + count * np.arange(parts)).ravel(), parts)
-        rows = parts * count
-        weight = sp.bsr_matrix((blocks, column, parts * np.arange(rows + 1)), shape=(3 * rows, 3 * rows))
-        return self._columns @ (weight @ self._rows)
+    def _product(self, inverse: Array) -> Array:
+        """The blocks of G' H G of the contacts and bodies of this rank, for the blocks H (nc, 3 parts, 3 parts)."""
+        out = np.zeros((self._pairs, 6, 6))
+        _add_products(self._starts, self._blocks, np.ascontiguousarray(inverse), self._place, out)
+        return out
 
     def _index(self, G: BlockRows) -> None:
         """Find the owners of the blocks to which this rank's contacts contribute, and the pattern of the own rows."""
         starts = offsets(self.comm, G.columns)
         self._first, own = int(starts[self.comm.rank]), G.columns
-        local = self._product(np.tile(np.eye(3 * self._parts), (G.rows // self._parts, 1, 1)))
-        row = np.repeat(self.bodies, np.diff(local.indptr))
-        column = self.bodies[local.indices]
+        self._starts = np.asarray(G.indptr, np.int64)
+        pairs, place = np.unique(_pairs(self._starts, self._column, self._parts), return_inverse=True)
+        self._place, self._pairs = place.ravel(), len(pairs)
+        row, column = (self.bodies[each] for each in np.divmod(pairs, max(len(self.bodies), 1)))
         self._owner = np.searchsorted(starts, row, side="right") - 1
         self._away = self._owner != self.comm.rank
         home, diagonal = ~self._away, self._first + np.arange(own)
         away = {"row": row[self._away], "column": column[self._away]}
         received = exchange(self.comm, away, self._owner[self._away])
         self._total = max(int(starts[-1]), 1)
-        pairs = ((row[home], column[home]), (received["row"], received["column"]), (diagonal, diagonal))
-        names = [r * self._total + c for r, c in pairs]
+        named = ((row[home], column[home]), (received["row"], received["column"]), (diagonal, diagonal))
+        names = [r * self._total + c for r, c in named]
         every = np.unique(np.concatenate(names))
         self._own_places, self._received_places, self._diagonal = (np.searchsorted(every, n) for n in names)
         self._row, self._indices = np.divmod(every, self._total)
@@ -147,7 +140,7 @@ class BodyMatrix:
 
     def update(self, inverse: Array) -> None:
         """Compute K for the blocks H (nc, 3 parts, 3 parts)."""
-        blocks = self._product(inverse).data.reshape(-1, 6, 6)
+        blocks = self._product(inverse)
         self._values = np.zeros((len(self._indices), 6, 6))
         self._values[self._own_places] = blocks[~self._away] if self._away.any() else blocks
         if self.comm.size > 1:
@@ -204,3 +197,46 @@ class BodyMatrix:
     def destroy(self) -> None:
         if self._whole is not None:
             self._whole.destroy()
+
+
+@loop
+def _pairs(starts, column, parts):
+    """Of each pair of blocks of a contact, in the order of `_add_products`, the row and the column as one number."""
+    count, bodies, k = (len(starts) - 1) // parts, 0, 0
+    for each in column:
+        bodies = max(bodies, each + 1)
+    for c in range(count):
+        blocks = 0
+        for p in range(parts):
+            blocks += starts[p * count + c + 1] - starts[p * count + c]
+        k += blocks * blocks
+    out, k = np.empty(k, np.int64), 0
+    for c in range(count):
+        for p in range(parts):
+            for f in range(starts[p * count + c], starts[p * count + c + 1]):
+                for q in range(parts):
+                    for e in range(starts[q * count + c], starts[q * count + c + 1]):
+                        out[k] = column[e] * bodies + column[f]
+                        k += 1
+    return out
+
+
+@loop
+def _add_products(starts, blocks, H, place, out):
+    """out += the blocks of G' H G, for block rows of G from ``starts`` on and blocks H (nc, 3 parts, 3 parts)."""
+    count, parts, k, HG = len(H), H.shape[1] // 3, 0, np.empty((3, 6))
+    for c in range(count):
+        for p in range(parts):
+            for f in range(starts[p * count + c], starts[p * count + c + 1]):
+                for q in range(parts):
+                    for i in range(3):
+                        x, y, z = H[c, 3 * q + i, 3 * p], H[c, 3 * q + i, 3 * p + 1], H[c, 3 * q + i, 3 * p + 2]
+                        for n in range(6):
+                            HG[i, n] = x * blocks[f, 0, n] + y * blocks[f, 1, n] + z * blocks[f, 2, n]
+                    for e in range(starts[q * count + c], starts[q * count + c + 1]):
+                        to = out[place[k]]
+                        k += 1
+                        for m in range(6):
+                            x, y, z = blocks[e, 0, m], blocks[e, 1, m], blocks[e, 2, m]
+                            for n in range(6):
+                                to[m, n] += x * HG[0, n] + y * HG[1, n] + z * HG[2, n]

@@ -93,7 +93,7 @@ BELOW = {
     "dem": {},
     "pctt.tt": {},
     "dem.contact_map": {"dem.arrays", "dem.compiled", "dem.exchange"},
-    "pctt.body_matrix": {"pctt.blocks", "dem.contact_map", "dem.exchange"},
+    "pctt.body_matrix": {"pctt.blocks", "dem.compiled", "dem.contact_map", "dem.exchange"},
     "pctt.mat": {
         "pctt.disk", "dem.exchange", "dem.geometry.morton", "pctt.options", "pctt.petsc",
         "pctt.tt",

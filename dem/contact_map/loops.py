@@ -259,19 +259,25 @@ def weights(frame, arm, body, H, weight):
 @loop
 def add_body_blocks(frame, arm, body, weight, blocks):
     """blocks (bodies, 6, 6) += the diagonal blocks of D H D', for the ``weight`` of `weights`."""
-    J = np.zeros((3, 6))  # from the velocities of the body to the velocity of the contact point
-    J[0, 0] = J[1, 1] = J[2, 2] = 1.0
+    T, of = np.empty((3, 6)), np.arange(9)  # W J, with J = [1, X] from the velocities of a body to that of the point
+    if weight.shape[1] == 6:
+        of[3:] = 1, 3, 4, 2, 4, 5
     for c in range(len(frame)):
         for side in range(2):
-            at = body[c, side]
-            r0, r1, r2 = arm[c, 3 * side], arm[c, 3 * side + 1], arm[c, 3 * side + 2]
-            J[0, 4], J[0, 5] = r2, -r1
-            J[1, 3], J[1, 5] = -r2, r0
-            J[2, 3], J[2, 4] = r1, -r0
-            for n in range(6):
-                h0, h1, h2 = weighted(weight, c, J[0, n], J[1, n], J[2, n])
-                for k in range(6):
-                    blocks[at, k, n] += J[0, k] * h0 + J[1, k] * h1 + J[2, k] * h2
+            to = blocks[body[c, side]]
+            x, y, z = arm[c, 3 * side], arm[c, 3 * side + 1], arm[c, 3 * side + 2]
+            for k in range(3):  # a row of W X is the way r to the point times a row of W
+                u, v, w = weight[c, of[3 * k]], weight[c, of[3 * k + 1]], weight[c, of[3 * k + 2]]
+                T[k, 0], T[k, 1], T[k, 2] = u, v, w
+                T[k, 3], T[k, 4], T[k, 5] = y * w - z * v, z * u - x * w, x * v - y * u
+            for n in range(6):  # and X' is r times a column
+                u, v, w = T[0, n], T[1, n], T[2, n]
+                to[0, n] += u
+                to[1, n] += v
+                to[2, n] += w
+                to[3, n] += y * w - z * v
+                to[4, n] += z * u - x * w
+                to[5, n] += x * v - y * u
 
 
 @loop
@@ -354,6 +360,15 @@ def scale(root, v, out):
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4], out[i, 5] = scaled_row(
             root, i, v[i, 0], v[i, 1], v[i, 2], v[i, 3], v[i, 4], v[i, 5]
         )
+
+
+@loop
+def add_scaled(root, v, m, out):
+    """out = v + R m for v, m and out (bodies, 6); m may have more rows."""
+    for i in prange(len(root)):
+        m0, m1, m2, m3, m4, m5 = scaled_row(root, i, m[i, 0], m[i, 1], m[i, 2], m[i, 3], m[i, 4], m[i, 5])
+        out[i, 0], out[i, 1], out[i, 2] = v[i, 0] + m0, v[i, 1] + m1, v[i, 2] + m2
+        out[i, 3], out[i, 4], out[i, 5] = v[i, 3] + m3, v[i, 4] + m4, v[i, 5] + m5
 
 
 @inlined

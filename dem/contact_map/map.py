@@ -184,12 +184,18 @@ class ContactMap:
             self._sum_forces(self._m)
         else:
             self._add_through(weight)
-        np.add(v, self.mass.momenta(self._m, np.zeros(self.mass.axes)), out=out.reshape(-1, 6))
+        if self.couples:
+            np.add(v, self.mass.momenta(self._m, np.zeros(self.mass.axes)), out=out.reshape(-1, 6))
+        else:
+            loops.add_scaled(self.mass.root, v, self._m, out.reshape(-1, 6))
         self.log_flops(72 * self.rows + 18 * self.columns)
 
     def _add_through(self, weight: Floats) -> None:
         """The momenta G' H G v, not yet scaled by masses, of the velocities that are on their way."""
         self._m[:] = 0.0
+        if not self.halo.talks:
+            self._add(loops.add_through, self._own, weight, self._w, self._m)
+            return
         half, rest, away = self._pieces
         self._add(loops.add_through, half, weight, self._w, self._m)
         self.halo.end_update(self._w)

@@ -10,8 +10,11 @@ from problems import SELF, Known, from_graph, from_matrix, heap, known_optimum, 
 
 from dem.contact_map import BlockRows
 from pctt import ccp, memory
-from pctt.ccp import ConeProblem, Limits, newton_for
+from pctt.ccp import ConeProblem, Limits, Newton, newton_for
+from pctt.ccp.interior.conic import Conic
 from pctt.ccp.newton import by_elimination
+from pctt.ccp.newton import factor as factor_of
+from pctt.ccp.newton.conjugate_gradients import ConjugateGradients
 from pctt.ccp.newton.krylov import Krylov
 
 FORMS = pytest.mark.parametrize("form", ["contact", "body"])
@@ -97,12 +100,18 @@ def test_a_packing_to_high_accuracy(form, tol):
 def test_its_systems_change_from_block_jacobi_to_factors_if_the_memory_has_room(room, monkeypatch):
     used = []
 
-    def noted(krylov, *arguments, **keywords):
-        used.append((krylov.ksp.getType(), krylov.ksp.pc.getType()))
-        return once(krylov, *arguments, **keywords)
+    def note(kind, name):
+        once = kind.solve
 
-    once = Krylov.solve
-    monkeypatch.setattr(Krylov, "solve", noted)
+        def noted(krylov, *arguments, **keywords):
+            used.append(name(krylov))
+            return once(krylov, *arguments, **keywords)
+
+        monkeypatch.setattr(kind, "solve", noted)
+
+    note(Krylov, lambda krylov: (krylov.ksp.getType(), krylov.ksp.pc.getType()))
+    note(ConjugateGradients, lambda krylov: ("cg", "pbjacobi"))
+    monkeypatch.setattr(factor_of, "EASY", 6.0)
     if not room:
         monkeypatch.setattr(memory, "available", lambda comm: 1e5)
     G, r, mu = packing(8 if room else 5)
@@ -114,6 +123,24 @@ def test_its_systems_change_from_block_jacobi_to_factors_if_the_memory_has_room(
     jacobi, factor = ("cg", "pbjacobi"), ("cg", "python")
     assert list(dict.fromkeys(used)) == ([jacobi, factor] if room else [jacobi])  # in the order of their first use
     newton.destroy()
+
+
+def test_linear_solves_begin_from_those_of_the_last_step(monkeypatch):
+    """Those of a predictor from both of the step before, of a corrector from the predictor's."""
+    found, begun = [], []
+
+    def solved(newton, q, tol, r_v=None, earlier=(), uncoupled=None):
+        dg, x = once(newton, q, tol, r_v, earlier, uncoupled)
+        begun.append([next(k for k, other in enumerate(found) if other is each) for each in earlier])
+        found.append(x)
+        return dg, x
+
+    once = Newton.solve
+    monkeypatch.setattr(Newton, "solve", solved)
+    G, r, mu = packing()
+    limits, two = Limits(1e-10, 3, fallback=False), Conic(short=0.0)  # directions in each step
+    ccp.solve(ConeProblem(SELF, r, mu, G=G), None, "conic", limits, two, law=ccp.RELAXATION)
+    assert begun == [[], [0], [0, 1], [2], [2, 3], [4]]
 
 
 def test_the_share_of_the_memory_is_a_part_of_what_the_machine_has():

@@ -248,7 +248,7 @@ def test_right_hand_sides_of_a_step_by_their_definitions(slides):
     w, ds, dz = rng.normal(size=(3, 100, 3))
     u = slides * rng.normal(size=(100, 3)) * [0, 1, 1]
     W = Scaling(s, z)
-    c, f = algebra.right_hand_sides(*W.parts, s, z, u, w)
+    c, f = algebra.right_hand_sides(*W.parts, z, u, w), algebra.uncoupled_changes(*W.parts, s, w)
     expected = W.divide(w) - z
     expected[:, 0] -= (u * expected).sum(axis=1)
     np.testing.assert_allclose(c, expected, rtol=1e-9, atol=1e-9)

@@ -123,10 +123,7 @@ class ArrowInverse(NamedTuple):
         cancel, where a product with W^-2 would end at 1e-6. What rounding leaves of dy_n the cones share."""
         cones = self.lorentz
         dz = cones.apply(dy)
-        dz[:, 0] = self.rise * (f[:, 0] - ds[:, 0]) - self.turn[:, 0] * dz[:, 1] - self.turn[:, 1] * dz[:, 2]
-        part = cones.weight * self.part.reshape(cones.number, -1)
-        lack = dy[: cones.count, 0] - (cones.weight * dz[:, 0].reshape(cones.number, -1)).sum(axis=0)
-        dz[:, 0] += (part * (lack / (cones.weight * part).sum(axis=0))).ravel()
+        _share_normals(dy, f, ds, cones.weight, (self.rise, self.turn, self.part), dz)
         return dz
 
     def uncoupled(self, f: Array, r: Array) -> Array:
@@ -243,6 +240,21 @@ def _uncoupled(f, r, weights, place, tangential, parts, out):
 
 
 @loop
+def _share_normals(dy, f, ds, weight, parts, dz):
+    """The normal numbers of dz in `ArrowInverse.dual_step`."""
+    (rise, turn, part), (cones, count) = parts, weight.shape
+    total = cones * count
+    for c in range(count):
+        lack, shared = dy[c, 0], 0.0
+        for i in range(c, total, count):
+            dz[i, 0] = rise[i] * (f[i, 0] - ds[i, 0]) - turn[i, 0] * dz[i, 1] - turn[i, 1] * dz[i, 2]
+            lack -= weight[i // count, c] * dz[i, 0]
+            shared += weight[i // count, c] ** 2 * part[i]
+        for i in range(c, total, count):
+            dz[i, 0] += weight[i // count, c] * part[i] * (lack / shared)
+
+
+@loop
 def _barriers(root, size, u, weight, live, place, least, more, B):
     count, total = len(B), len(root)
     for c in range(count):
@@ -304,16 +316,24 @@ def scaling(s: Array, z: Array) -> tuple[Array, Array]:
 
 
 @loop
-def right_hand_sides(root: Array, size: Array, s: Array, z: Array, u: Array, w: Array) -> tuple[Array, Array]:
-    """T^-1 (W^-1 w - z) and W w - s (nc, 3); u (nc, 3) is the direction of sliding in T = 1 + e u'."""
-    out, other = np.empty(s.shape), np.empty(s.shape)
-    for c in range(len(s)):
+def right_hand_sides(root: Array, size: Array, z: Array, u: Array, w: Array) -> Array:
+    """T^-1 (W^-1 w - z) (nc, 3); u (nc, 3) is the direction of sliding in T = 1 + e u'."""
+    out = np.empty(z.shape)
+    for c in range(len(z)):
         n, t_1, t_2 = _scaled(root, size, c, w, True)
         n, t_1, t_2 = n - z[c, 0], t_1 - z[c, 1], t_2 - z[c, 2]
         out[c, 0], out[c, 1], out[c, 2] = n - (u[c, 1] * t_1 + u[c, 2] * t_2), t_1, t_2
+    return out
+
+
+@loop
+def uncoupled_changes(root: Array, size: Array, s: Array, w: Array) -> Array:
+    """W w - s (nc, 3): ds of each cone without the others."""
+    out = np.empty(s.shape)
+    for c in range(len(s)):
         n, t_1, t_2 = _scaled(root, size, c, w, False)
-        other[c, 0], other[c, 1], other[c, 2] = n - s[c, 0], t_1 - s[c, 1], t_2 - s[c, 2]
-    return out, other
+        out[c, 0], out[c, 1], out[c, 2] = n - s[c, 0], t_1 - s[c, 1], t_2 - s[c, 2]
+    return out
 
 
 @loop

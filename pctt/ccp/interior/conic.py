@@ -47,6 +47,7 @@ from pctt.options import number
 if TYPE_CHECKING:
     from pctt.ccp.newton import Newton
 
+LARGE = 100.0  # of the impulses that the data suggest: smaller ones of an unbounded problem are far from the tolerance
 LESS, HALF = 0.9, 0.5  # of the least residual, and of the last complementarity, that count as progress
 
 
@@ -79,12 +80,14 @@ def solve(
         return Result(guess, Status.GIVEN_UP, words, np.inf, 0)
     conic = ConicProblem(problem, options, coulomb, newton.system.error_in_momenta)
     at, history, waited, least, last_gap = conic.start(guess), list[float](), 0, np.inf, np.inf
+    recent: tuple[Array, ...] = ()  # solutions of the last step: those of this one are alike
     while True:
         # residuals
         found, gap = conic.residuals(at), problem.dot(at.s, at.z)
         history.append(limits.residual(found.errors))
         limits.report(len(history) - 1, history[-1])
-        unbounded = bool(why_unbounded(given, found.g, found.y))
+        large = problem.norm(found.g) > LARGE * problem.norm(problem.r) / problem.mean_diagonal
+        unbounded = large and bool(why_unbounded(given, found.g, found.y))
         if unbounded or history[-1] == min(history):
             best = found.g
         progress = found.errors.natural <= LESS * least or gap <= HALF * last_gap
@@ -98,7 +101,7 @@ def solve(
         newton.update(*linear.blocks(), symmetric=not coulomb)
         # affine step
         with phase("ConicPredictor"):
-            affine = linear.direction(newton, np.zeros(at.z.shape))
+            affine = linear.direction(newton, np.zeros(at.z.shape), *recent)
         # centring: the further the affine step may go, the less (Mehrotra)
         target = max((1.0 - min(1.0, linear.reach(affine))) ** 3, options.least) * gap / conic.count
         with phase("ConicCorrector"):
@@ -113,7 +116,7 @@ def solve(
                 step, direction = max((step, direction), (linear.step(other), other), key=lambda pair: pair[0])
         # update
         if step > 0:
-            at = conic.moved(at, direction, step)
+            at, recent = conic.moved(at, direction, step), (affine.x, direction.x)
     iterations = len(history) - 1
     status, words = Status.STALLED, f"stalled after {iterations} iterations"
     if min(history) <= limits.tol:
@@ -245,15 +248,16 @@ class Linearised(NamedTuple):
     def direction(self, newton: Newton, w: Array, *earlier: Array) -> Direction:
         """The direction of the right-hand side w; ``earlier``: solutions of the Newton system to begin from."""
         problem, form, found = self.conic.problem, self.conic.form, self.found
-        c, f = lorentz.right_hand_sides(*self.W, self.at.s, self.at.z, self.u, w)
-        q = form.transpose(c) - found.r_y
-        uncoupled = None if self.arrow is None else self.arrow.uncoupled(f, found.r_y)
-        dg, x = newton.solve(q, self.tol, found.r_v, earlier, uncoupled)
-        dv, ds = newton.system.momenta(x, dg, found.r_v), form.apply(dg)
         if self.arrow is not None:  # r_y vanishes, r_v takes the error of the linear solve
-            dy = problem.velocity_of(dv) + problem.compliance * dg + found.r_y
+            f = lorentz.uncoupled_changes(*self.W, self.at.s, w)
+            dg, x = newton.solve(None, self.tol, found.r_v, earlier, self.arrow.uncoupled(f, found.r_y))
+            dv, ds = newton.system.momenta(x, dg, found.r_v), form.apply(dg)
+            dy = newton.system.velocity + problem.compliance * dg + found.r_y
             dy = self.arrow.dual_step(dy, f, ds)
         else:  # r_v vanishes, r_y takes it
+            c = lorentz.right_hand_sides(*self.W, self.at.z, self.u, w)
+            dg, x = newton.solve(form.transpose(c) - found.r_y, self.tol, found.r_v, earlier)
+            dv, ds = newton.system.momenta(x, dg, found.r_v), form.apply(dg)
             dy = lorentz.subtract_inverse_squared(*self.W, self.u, c, ds)
         return Direction(ds, self._turned(dy), dy, dv, x)
 

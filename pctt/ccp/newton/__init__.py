@@ -202,7 +202,7 @@ class Newton:
 
     def solve(
         self,
-        q: Array,
+        q: Array | None,
         tol: float,
         r_v: Array | None = None,
         earlier: Sequence[Array] = (),
@@ -211,7 +211,7 @@ class Newton:
         """dg (nc, 3) and the system's solution x, to a residual of ``tol`` [m/s, over all contacts]. ``earlier`` are
         earlier solutions x to begin from; a fixed ``-ksp_rtol`` refers to the residual that they leave. ``uncoupled``
         is (B + C)^-1 q, the change of each contact without the others, for callers that have it more accurately than by
-        a product."""
+        a product; a system with `error_in_momenta` needs no q then."""
         with phase("CCPKrylov"):
             b = self.system.right_hand_side(q, r_v, uncoupled)
             x = self.linear.solve(b, tol / self.system.speed, earlier)

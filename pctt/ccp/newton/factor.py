@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 #: Drop tolerance of a factor [mass]: entries of a block between bodies that it is better off without.
 LEAST = 0.1
-#: Iterations with block Jacobi / bodies^0.4 that cost less than a factor, which costs as much as 8 to 14.
-EASY = 6.0
+#: Iterations with block Jacobi / bodies^0.4 that cost less than a factor, which costs as much as 14 to 30.
+EASY = 12.0
 #: Iterations with factors of single precision, in units of the easy ones, after which the next are of double, which
 #: cost 10 iterations more (n = 8), 30 (n = 16).
-SINGLE = 0.02
+SINGLE = 0.01
 #: Memory of a factor in double precision / rows^(4/3), the growth of nested dissection in space: 2.7e9 bytes at 35,939
 #: bodies by fronts.
 BYTES = 210.0

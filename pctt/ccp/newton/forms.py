@@ -44,6 +44,7 @@ class Form:
     update: Callable[..., None]
     right_hand_side: Callable[..., Array]
     impulses: Callable[..., Array]
+    velocity: Array  #: G dv (rows, 3) of the last `impulses`, where these have come from momenta
 
     def fits(self, kkt: KKT) -> bool:
         """Whether the matrix can take the values of these constraints."""
@@ -141,11 +142,12 @@ class ContactForm(Form):
             self.problem.N.copy(old, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
         return old
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
+    def right_hand_side(self, q: Array | None, r_v: Array | None, uncoupled: Array | None) -> Array:
         """Of the system for x. ``uncoupled`` is (B + C)^-1 q, if the caller has it more accurately."""
+        assert q is not None
         return q.ravel() if r_v is None else (q + self.problem.velocity_of(r_v)).ravel()
 
-    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
+    def impulses(self, x: Array, q: Array | None, uncoupled: Array | None) -> Array:
         """dg (nc, 3) of a solution."""
         return x.reshape(-1, 3).copy()
 
@@ -178,7 +180,8 @@ class GivenForm(ContactForm):
     def N(self) -> sp.bsr_matrix:  # noqa: N802 - as in formulas
         return self.problem.operator.local  # type: ignore[union-attr]
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
+    def right_hand_side(self, q: Array | None, r_v: Array | None, uncoupled: Array | None) -> Array:
+        assert q is not None
         return q.ravel()
 
 
@@ -252,16 +255,19 @@ class BodyForm(Form):
     def speed(self) -> float:
         return float(self.problem.mean_diagonal**0.5)
 
-    def right_hand_side(self, q: Array, r_v: Array | None, uncoupled: Array | None) -> Array:
-        times = self.problem.cones.times
-        push = self.problem.momentum(times(self._inverse, q) if uncoupled is None else uncoupled)
+    def right_hand_side(self, q: Array | None, r_v: Array | None, uncoupled: Array | None) -> Array:
+        if uncoupled is None:
+            assert q is not None
+            uncoupled = self.problem.cones.times(self._inverse, q)
+        push = self.problem.momentum(uncoupled)
         return push if r_v is None else push - r_v
 
-    def impulses(self, x: Array, q: Array, uncoupled: Array | None) -> Array:
-        times = self.problem.cones.times
+    def impulses(self, x: Array, q: Array | None, uncoupled: Array | None) -> Array:
+        times, self.velocity = self.problem.cones.times, self.problem.velocity_of(x)
         if uncoupled is None:
-            return times(self._inverse, q - self.problem.velocity_of(x))
-        return uncoupled - times(self._inverse, self.problem.velocity_of(x))
+            assert q is not None
+            return times(self._inverse, q - self.velocity)
+        return uncoupled - times(self._inverse, self.velocity)
 
     def momenta(self, x: Array, dg: Array, r_v: Array) -> Array:
         return x

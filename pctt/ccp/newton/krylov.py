@@ -155,7 +155,7 @@ class Krylov:
             self._reset()  # else MUMPS, once failed, fails for every later matrix
         residual = b.duplicate()
         A.mult(x, residual)
-        true = _part_left(residual, b, x)
+        true = part_left(residual, b, x)
         # twice: BiCGStab's recursive residual may drift a little without harm
         converged = reason > 0 and true <= 2 * self.rtol
         words = _REASONS.get(reason, str(reason))
@@ -276,7 +276,7 @@ def _continued(viewer: str | None) -> str | None:
     return ":".join([*parts, ""][:3] + ["append"]) if len(parts) in (2, 3) and parts[1] else viewer
 
 
-def _part_left(product: PETSc.Vec, b: PETSc.Vec, x: PETSc.Vec) -> float:
+def part_left(product: PETSc.Vec, b: PETSc.Vec, x: PETSc.Vec) -> float:
     """||b - S x|| / ||b|| of the product S x, which is destroyed; an x that is no number becomes zero, and leaves 1."""
     residual = product
     residual.aypx(-1.0, b)
