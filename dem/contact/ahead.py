@@ -160,8 +160,8 @@ def turn_ahead(
             own = plus(plus(plus(middle, -0.5 * after, n), -1.0, apart), h, plus(W, -1.0, V))
             their = plus(middle, 0.5 * after, n)
         start = of_start(lasting, c, sign)
-        rests = _rests(moves[A], V, u) or _rests(moves[B], W, w)
-        if here and rests and gap[c] <= CLOSE * core:
+        given = not (moves[A] and moves[B])
+        if here and given and gap[c] <= CLOSE * core:
             start = sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]
         lasts = dot(start, start) > 0.0
         if not lasts:
@@ -179,7 +179,7 @@ def turn_ahead(
             inside = after_turn(plus(own, -1.0, arc), u, -h)
         if h == 0.0 or dot(n, n) == 0.0:
             continue
-        lasts &= rests or (flat and dot(arc, arc) > 0.0)
+        lasts &= given or (flat and dot(arc, arc) > 0.0)
         n = start if lasts else n
         below = plus(center[b], -1.0, place[B]) if kind[b] == SPHERE else after_turn(plus(their, -1.0, bow), w, -h)
         if moves[A] or lasts:
@@ -194,6 +194,10 @@ def turn_ahead(
             below = plus(below, linear[c], n)
             their = below if moves[B] else their
         more = plus(_bend(below, w, dt), -1.0, _bend(inside, u, dt))
+        if flat:  # the contact goes along the face
+            slide = plus(plus(V, 1.0, cross(u, inside)), 1.0 / h, plus(arc, -1.0, first_arc))
+            slide = plus(plus(slide, -1.0, W), -1.0, cross(w, below))
+            more = plus(more, 0.5 * dt if moves[A] or lasts else 0.5 * dt - h, cross(w, slide))
         if kind[b] != SPHERE:
             more = plus(more, 1.0, cross(w, plus(plus(below, 1.0, first_bow), -1.0, their)))
         more = plus(more, -1.0, cross(u, plus(plus(inside, 1.0, first_arc), -1.0, own)))
@@ -224,12 +228,6 @@ def of_start(lasting, c, sign):
     if not len(lasting):
         return 0.0, 0.0, 0.0
     return sign * lasting[c, 0], sign * lasting[c, 1], sign * lasting[c, 2]
-
-
-@inlined
-def _rests(moves, velocity, spin):
-    """Whether a body is at rest, and impulses do not move it."""
-    return (not moves) and dot(velocity, velocity) + dot(spin, spin) == 0.0
 
 
 @loop
