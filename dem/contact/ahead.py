@@ -236,9 +236,9 @@ def nearest_normals(
 ) -> Floats:
     """Return for contacts (k,) of guests in these rows the normals (k, 3) that they have now: of the contacts now (l,)
     of the same pair that touch, at most NEAREST half thicknesses of the guest away, that of nearly the same direction;
-    their own where there is none."""
+    zeros where there is none."""
     (kind, _, size, _), (point, normal, _), (now_point, now_normal, now_gap) = forms, touch, now
-    out, last, before = normal.copy(), np.full(pair.max() + 1, -1), np.empty(len(now_pair), np.int64)
+    out, last, before = np.zeros(normal.shape), np.full(pair.max() + 1, -1), np.empty(len(now_pair), np.int64)
     for n in range(len(now_pair)):
         before[n], last[now_pair[n]] = last[now_pair[n]], n
     for c in range(len(pair)):
