@@ -15,14 +15,18 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
+from dem.bodies import CONVEX
 from dem.compiled import loop
 from dem.exchange import on_any
+from dem.model.world import World
+from dem.shapes import Convex
 
 if TYPE_CHECKING:
     from dem.contact import Contacts
     from dem.contact_map import ContactMap
 
 MOST = 2.0  #: normal impulses of a body over those of the forces on it, above which it was struck in the last step
+SLOW = 0.5  #: of the speed that forces give in a step, at which contacts close that take over a load as bodies roll
 LEFT = 0.01  #: of what a contact bears before, which it bears beside that where it opens
 
 
@@ -43,9 +47,10 @@ class Landing(NamedTuple):
 
 
 def landing(
-    contacts: Contacts, contact_map: ContactMap, free: Floats, freely: Floats, last: Floats, dt: float
+    world: World, contacts: Contacts, contact_map: ContactMap, free: Floats, freely: Floats, last: Floats, dt: float
 ) -> Landing | None:
-    """Find what contacts bear until bodies land; None if none bears any that may. Bodies have the velocities `free`
+    """Find what contacts bear until bodies land; None if none bears any that may. On smooth rims and
+    faces contacts go from place to place without impacts: there they are left out. Bodies have the velocities `free`
     (rows, 6) without contacts, contacts `freely` (nc, 3) [m/s], and `last` (nc, 3) are the impulses of the last step;
     collective."""
     table, gap = contacts.near.bodies, contacts.linear_gap
@@ -53,9 +58,14 @@ def landing(
     body, bears = _bearing(contacts.a, contacts.b, (table.mass, push), gap, freely, last, dt)
     if not on_any(contact_map.comm, bool(bears.any()))[0]:
         return None
+    smooth = table.shape >= CONVEX
+    first = contacts.near.grains + contacts.near.ghosts
+    smooth[first:] = [any(isinstance(part, Convex) for part in large.shapes) for large in world.large_bodies]
+    bears &= ~smooth[body]
     whole = np.where(bears[:, None], last, 0.0)
     speed = -dt * (freely[:, 0] + contact_map.velocities(contact_map.momenta(whole))[:, 0])
     lands = (body >= 0) & (last[:, 0] == 0.0) & (gap > 0.0) & (speed > gap)
+    lands &= speed > SLOW * dt * push[body]
     time = np.full(len(table.mass), np.inf)
     np.minimum.at(time, body[lands], gap[lands] / speed[lands])
     part = np.where(time < 1.0, 0.5 + time, 0.0)[body][:, None]

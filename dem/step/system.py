@@ -137,7 +137,7 @@ class ContactSystem:
             freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
         self._given: Floats | float = 0.0  #: mass-scaled momenta of what is no part of the cone problem
         self.later: Floats | None = None
-        self.landing = landing(contacts, self.contact_map, free, freely, last, dt)
+        self.landing = landing(world, contacts, self.contact_map, free, freely, last, dt)
         known = self.attraction is not None or self.landing is not None
         if known:
             self._given = momentum = self.contact_map.momenta(self.net(np.zeros_like(last)))
