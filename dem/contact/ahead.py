@@ -25,7 +25,7 @@ and the place goes along the face as it rolls on them: with the normal of the en
 take energy from a plank that rocks on a log, to first order. What rests on round grains keeps that of the end, which
 damps it.
 
-What touches bodies at rest has the normal of the start as well, with the gap of the end. So the force is along the
+What touches bodies of prescribed motion has the normal of the start as well, with the gap of the end. So the force is along the
 normal at the place between two velocities, as in the method SHAKE (Ryckaert, Ciccotti, Berendsen, J. Comput. Phys. 23,
 1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge, without loss.
 
@@ -194,10 +194,14 @@ def turn_ahead(
             below = plus(below, linear[c], n)
             their = below if moves[B] else their
         more = plus(_bend(below, w, dt), -1.0, _bend(inside, u, dt))
-        if flat:  # the contact goes along the face
-            slide = plus(plus(V, 1.0, cross(u, inside)), 1.0 / h, plus(arc, -1.0, first_arc))
-            slide = plus(plus(slide, -1.0, W), -1.0, cross(w, below))
-            more = plus(more, 0.5 * dt if moves[A] or lasts else 0.5 * dt - h, cross(w, slide))
+        if flat and dot(w, n) != 0.0:
+            # The contact goes along a face that spins; as in the middle of the last step, whose velocities bodies have.
+            slide = plus(_before(V, u, moves[A], dt), 1.0, cross(u, after_turn(inside, u, -0.5 * dt)))
+            slide = plus(slide, 1.0 / h, plus(arc, -1.0, first_arc))
+            slide = plus(slide, -1.0, _before(W, w, moves[B], dt))
+            slide = plus(slide, -1.0, cross(w, after_turn(below, w, -0.5 * dt)))
+            about = plus(_ZERO, dot(w, n), n)
+            more = plus(more, 0.5 * dt if moves[A] or lasts else 0.5 * dt - h, cross(about, slide))
         if kind[b] != SPHERE:
             more = plus(more, 1.0, cross(w, plus(plus(below, 1.0, first_bow), -1.0, their)))
         more = plus(more, -1.0, cross(u, plus(plus(inside, 1.0, first_arc), -1.0, own)))
@@ -228,6 +232,12 @@ def of_start(lasting, c, sign):
     if not len(lasting):
         return 0.0, 0.0, 0.0
     return sign * lasting[c, 0], sign * lasting[c, 1], sign * lasting[c, 2]
+
+
+@inlined
+def _before(velocity, spin, moves, dt):
+    """The velocity of a body in the last step: of one of prescribed motion as it turns with its spin."""
+    return velocity if moves else after_turn(velocity, spin, -dt)
 
 
 @loop

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
-from dem.bodies import CONVEX
+from dem.bodies import BOX, CONVEX, POLYHEDRON
 from dem.compiled import loop
 from dem.exchange import on_any
 from dem.model.world import World
-from dem.shapes import Convex
+from dem.shapes import Capsule, Convex, Sphere
 
 if TYPE_CHECKING:
     from dem.contact import Contacts
@@ -49,18 +49,19 @@ class Landing(NamedTuple):
 def landing(
     world: World, contacts: Contacts, contact_map: ContactMap, free: Floats, freely: Floats, last: Floats, dt: float
 ) -> Landing | None:
-    """Find what contacts bear until bodies land; None if none bears any that may. On smooth rims and
-    faces contacts go from place to place without impacts: there they are left out. Bodies have the velocities `free`
+    """Find what contacts bear until bodies land; None if none bears any that may. Bodies have the velocities `free`
     (rows, 6) without contacts, contacts `freely` (nc, 3) [m/s], and `last` (nc, 3) are the impulses of the last step;
-    collective."""
+    collective. Contacts of bodies that are round somewhere go from place to place without impacts: they are left out.
+    """
     table, gap = contacts.near.bodies, contacts.linear_gap
     push = np.linalg.norm(free[:, :3] - table.velocity[:, :3], axis=1)
     body, bears = _bearing(contacts.a, contacts.b, (table.mass, push), gap, freely, last, dt)
     if not on_any(contact_map.comm, bool(bears.any()))[0]:
         return None
-    smooth = table.shape >= CONVEX
+    smooth = (table.shape != BOX) & ((table.shape < POLYHEDRON) | (table.shape >= CONVEX))
     first = contacts.near.grains + contacts.near.ghosts
-    smooth[first:] = [any(isinstance(part, Convex) for part in large.shapes) for large in world.large_bodies]
+    round_parts = Sphere, Capsule, Convex
+    smooth[first:] = [any(isinstance(part, round_parts) for part in large.shapes) for large in world.large_bodies]
     bears &= ~smooth[body]
     whole = np.where(bears[:, None], last, 0.0)
     speed = -dt * (freely[:, 0] + contact_map.velocities(contact_map.momenta(whole))[:, 0])
