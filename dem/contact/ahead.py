@@ -25,9 +25,10 @@ and the place goes along the face as it rolls on them: with the normal of the en
 take energy from a plank that rocks on a log, to first order. What rests on round grains keeps that of the end, which
 damps it.
 
-What touches bodies of prescribed motion has the normal of the start as well, with the gap of the end. So the force is along the
-normal at the place between two velocities, as in the method SHAKE (Ryckaert, Ciccotti, Berendsen, J. Comput. Phys. 23,
-1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge, without loss.
+What touches bodies of prescribed motion has the normal of the start as well, with the gap of the end. So the force is
+along the normal at the place between two velocities, as in the method SHAKE (Ryckaert, Ciccotti, Berendsen, J. Comput.
+Phys. 23, 1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge,
+without loss, also where bowl and edge move.
 
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found

@@ -256,8 +256,8 @@ def lasting(
     table: Primitives, i: Ints, j: Ints, delta: Floats, found: Manifold, course: Course, grains: int
 ) -> Floats:
     """The normals (nc, 3) of the start of the step for contacts of pairs of rows i, j (m,) that keep them, for others
-    zeros; no row if none does. They are kept by round guests on flat faces of hosts that impulses move, and on bodies
-    at rest. The first rows of bodies, so many, are `grains`: these are no guests on faces, as what rests on a bed of
+    zeros; no row if none does. They are kept by round guests on flat faces of hosts that impulses move, and by what
+    touches bodies of prescribed motion. The first rows of bodies, so many, are `grains`: these are no guests on faces, as what rests on a bed of
     them would tremble. Those of contacts that are found where bodies are `turn_ahead` knows."""
     none = np.zeros((0, 3))
     if not table.bounded:
