@@ -257,8 +257,9 @@ def lasting(
 ) -> Floats:
     """The normals (nc, 3) of the start of the step for contacts of pairs of rows i, j (m,) that keep them, for others
     zeros; no row if none does. They are kept by round guests on flat faces of hosts that impulses move, and by what
-    touches bodies of prescribed motion. The first rows of bodies, so many, are `grains`: these are no guests on faces, as what rests on a bed of
-    them would tremble. Those of contacts that are found where bodies are `turn_ahead` knows."""
+    touches bodies of prescribed motion. The first rows of bodies, so many, are `grains`: these are no guests on faces,
+    as what rests on a bed of them would tremble. Those of contacts that are found where bodies are `turn_ahead`
+    knows."""
     none = np.zeros((0, 3))
     if not table.bounded:
         return none
