@@ -25,9 +25,10 @@ and the place goes along the face as it rolls on them: with the normal of the en
 take energy from a plank that rocks on a log, to first order. What rests on round grains keeps that of the end, which
 damps it.
 
-What touches bodies at rest has the normal of the start as well, with the gap of the end. So the force is along the
-normal at the place between two velocities, as in the method SHAKE (Ryckaert, Ciccotti, Berendsen, J. Comput. Phys. 23,
-1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge, without loss.
+What touches bodies of prescribed motion has the normal of the start as well, with the gap of the end. So the force is
+along the normal at the place between two velocities, as in the method SHAKE (Ryckaert, Ciccotti, Berendsen, J. Comput.
+Phys. 23, 1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge,
+without loss, also where bowl and edge move.
 
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
@@ -160,8 +161,8 @@ def turn_ahead(
             own = plus(plus(plus(middle, -0.5 * after, n), -1.0, apart), h, plus(W, -1.0, V))
             their = plus(middle, 0.5 * after, n)
         start = of_start(lasting, c, sign)
-        rests = _rests(moves[A], V, u) or _rests(moves[B], W, w)
-        if here and rests and gap[c] <= CLOSE * core:
+        given = not (moves[A] and moves[B])
+        if here and given and gap[c] <= CLOSE * core:
             start = sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]
         lasts = dot(start, start) > 0.0
         if not lasts:
@@ -179,7 +180,7 @@ def turn_ahead(
             inside = after_turn(plus(own, -1.0, arc), u, -h)
         if h == 0.0 or dot(n, n) == 0.0:
             continue
-        lasts &= rests or (flat and dot(arc, arc) > 0.0)
+        lasts &= given or (flat and dot(arc, arc) > 0.0)
         n = start if lasts else n
         below = plus(center[b], -1.0, place[B]) if kind[b] == SPHERE else after_turn(plus(their, -1.0, bow), w, -h)
         if moves[A] or lasts:
@@ -194,6 +195,14 @@ def turn_ahead(
             below = plus(below, linear[c], n)
             their = below if moves[B] else their
         more = plus(_bend(below, w, dt), -1.0, _bend(inside, u, dt))
+        if flat and dot(w, n) != 0.0:
+            # The contact goes along a face that spins; as in the middle of the last step, whose velocities bodies have.
+            slide = plus(_before(V, u, moves[A], dt), 1.0, cross(u, after_turn(inside, u, -0.5 * dt)))
+            slide = plus(slide, 1.0 / h, plus(arc, -1.0, first_arc))
+            slide = plus(slide, -1.0, _before(W, w, moves[B], dt))
+            slide = plus(slide, -1.0, cross(w, after_turn(below, w, -0.5 * dt)))
+            about = plus(_ZERO, dot(w, n), n)
+            more = plus(more, 0.5 * dt if moves[A] or lasts else 0.5 * dt - h, cross(about, slide))
         if kind[b] != SPHERE:
             more = plus(more, 1.0, cross(w, plus(plus(below, 1.0, first_bow), -1.0, their)))
         more = plus(more, -1.0, cross(u, plus(plus(inside, 1.0, first_arc), -1.0, own)))
@@ -227,9 +236,9 @@ def of_start(lasting, c, sign):
 
 
 @inlined
-def _rests(moves, velocity, spin):
-    """Whether a body is at rest, and impulses do not move it."""
-    return (not moves) and dot(velocity, velocity) + dot(spin, spin) == 0.0
+def _before(velocity, spin, moves, dt):
+    """The velocity of a body in the last step: of one of prescribed motion as it turns with its spin."""
+    return velocity if moves else after_turn(velocity, spin, -dt)
 
 
 @loop
@@ -238,9 +247,9 @@ def nearest_normals(
 ) -> Floats:
     """Return for contacts (k,) of guests in these rows the normals (k, 3) that they have now: of the contacts now (l,)
     of the same pair that touch, at most NEAREST half thicknesses of the guest away, that of nearly the same direction;
-    their own where there is none."""
+    zeros where there is none."""
     (kind, _, size, _), (point, normal, _), (now_point, now_normal, now_gap) = forms, touch, now
-    out, last, before = normal.copy(), np.full(pair.max() + 1, -1), np.empty(len(now_pair), np.int64)
+    out, last, before = np.zeros(normal.shape), np.full(pair.max() + 1, -1), np.empty(len(now_pair), np.int64)
     for n in range(len(now_pair)):
         before[n], last[now_pair[n]] = last[now_pair[n]], n
     for c in range(len(pair)):

@@ -256,19 +256,21 @@ def lasting(
     table: Primitives, i: Ints, j: Ints, delta: Floats, found: Manifold, course: Course, grains: int
 ) -> Floats:
     """The normals (nc, 3) of the start of the step for contacts of pairs of rows i, j (m,) that keep them, for others
-    zeros; no row if none does. They are kept by round guests on flat faces of hosts that impulses move, and on bodies
-    at rest. The first rows of bodies, so many, are `grains`: these are no guests on faces, as what rests on a bed of
-    them would tremble. Those of contacts that are found where bodies are `turn_ahead` knows."""
+    zeros; no row if none does. They are kept by round guests on flat faces of hosts that impulses move, and by what
+    touches bodies of prescribed motion. The first rows of bodies, so many, are `grains`: these are no guests on faces,
+    as what rests on a bed of them would tremble. Those of contacts that are found where bodies are `turn_ahead`
+    knows."""
     none = np.zeros((0, 3))
     if not table.bounded:
         return none
     kind, part = table.kind, table.row >= grains
-    rests, rolls = _at_rest(table, course, part), part & is_round(kind)
-    if not (rests.any() or rolls.any()):
+    given = part & (kind != PLANE) & ~course.moves[table.row]
+    rolls = part & is_round(kind)
+    if not (given.any() or rolls.any()):
         return none
     guest, host, swap = guests_and_hosts(kind, i, j, found.pair)
     normal, ahead = np.zeros((len(found.pair), 3)), (kind != SPHERE) & (kind != BOX)
-    if len(kept := np.flatnonzero((rests[guest] | rests[host]) & ((kind[guest] != SPHERE) | ahead[host]))):
+    if len(kept := np.flatnonzero((given[guest] | given[host]) & ((kind[guest] != SPHERE) | ahead[host]))):
         pairs, row = np.unique(found.pair[kept], return_inverse=True)
         now = touches(table, i[pairs], j[pairs], delta[pairs])
         of_pairs = table.tables()[0], table.hulls.inner, guest[kept]
@@ -279,13 +281,6 @@ def lasting(
         flat = rows[_on_faces(table, found, rows, host[rows], np.where(swap[rows], 1.0, -1.0)[:, None])]
         normal[flat] = found.touch.normal[flat]
     return normal
-
-
-def _at_rest(table: Primitives, course: Course, part: Bools) -> Bools:
-    """Which shapes (n,) but half spaces, which are flat, are parts of bodies at rest that impulses do not move."""
-    rests: Bools = part & (table.kind != PLANE) & ~course.moves[table.row]
-    rests[rests] = (course.velocity[table.row[rests]] == 0.0).all(axis=1)
-    return rests
 
 
 def _on_faces(table: Primitives, found: Manifold, rows: Ints, host: Ints, sign: Floats) -> Bools:

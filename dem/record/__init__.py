@@ -137,7 +137,9 @@ def energy_balance(step: Step) -> dict[str, float]:
     normal, tangential, came, opening = works(step, step.in_cone, velocity, step.moment)
     of_springs = elastic_energies(step, came, opening)
     attracted = 0.0 if system.attraction is None else works(step, step.impulse, velocity)[0] - normal
-    applied = belts = flow = 0.0
+    applied = belts = flow = landed = 0.0
+    if system.later is not None:
+        landed = sum(works(step, system.later, velocity)[:2])
     if system.applied is not None:
         applied = 0.5 * np.vdot(system.applied.grains, near.bodies.velocity[: near.grains] + world.grains.velocity)
     if system.surface is not None:
@@ -146,7 +148,7 @@ def energy_balance(step: Step) -> dict[str, float]:
         flow = -np.vdot(step.impulse, system.drift)
     whole = dict(zip(WHOLE, reduced(comm, (
         *of_bodies, *of_springs, normal, tangential, _carried(step, fixed), attracted, applied, belts, flow,
-        _bounced_work(step),
+        _bounced_work(step), landed,
     ), ())[0]))  # fmt: skip
     holding = _holding_work(step, near.bodies.velocity[first:], mean) if world.large_moves else 0.0
     held_by, held_at_end = _constraint_works(step, near.bodies.velocity[: near.grains], mean)
@@ -158,7 +160,7 @@ def energy_balance(step: Step) -> dict[str, float]:
     held, bent = whole["elastic_at_end"] - whole["elastic"], whole["strained_at_end"] - whole["strained"]
     pulled, released = 2.0 * max(whole["attracted"], 0.0), max(-held, 0.0) + max(-bent, 0.0)
     pulled += max(held_at_end - held_by, 0.0)  # with the velocity of the end, for bodies that were at rest
-    pulled += max(whole["bounced"], 0.0)
+    pulled += max(whole["bounced"], 0.0) + 2.0 * max(whole["landed"], 0.0)
     there = whole["kinetic_before"] + whole["still"] + whole["carried"]
     stored = whole["elastic"] + whole["strained"]
     created = rise - fallen - work - released - pulled > CREATED * (there + stored + abs(work))
@@ -191,7 +193,7 @@ def _bounced_work(step: Step) -> float:
 WHOLE = (
     "kinetic_before", "potential_before", "kinetic", "potential", "falling", "still", "least", "elastic",
     "elastic_at_end", "strained", "strained_at_end", "normal", "tangential", "carried", "attracted", "applied", "belts",
-    "flow", "bounced",
+    "flow", "bounced", "landed",
 )  # fmt: skip
 
 

@@ -32,6 +32,7 @@ from dem.free_motion import kept_velocities
 from dem.model.world import World
 from dem.parts.laws import Solved
 from dem.start import stiffness
+from dem.step.landing import landing
 from dem.step.laws import along_normal, contact_state, slowest
 from dem.step.resistance import resistance
 from dem.step.servo import cell_of
@@ -81,6 +82,8 @@ class ContactSystem:
         met: the contacts, as the laws of contact see them; None where none adds anything
         past (nc, columns): what the laws of contact kept of them in the last step
         attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.parts.laws`
+        landing: what contacts bear until bodies land, a `dem.step.landing.Landing`, or None
+        later (nc, 3): what of it they bear in the next step, which `kept` finds and gives bodies at once [N s]
         drives: of the large bodies, the same on all ranks
         at_once: how many contacts of this rank bounce with all others of the step, and not in their order
         coupling: by constraints, a `dem.unconstrained.constraints.Coupling`; None if there are none
@@ -132,14 +135,19 @@ class ContactSystem:
             freely += np.einsum("cij,cj->ci", self.frame, self.cell.free * way)
         if contacts.drift is not None:
             freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
-        self._attracted: Floats | float = 0.0  #: mass-scaled momenta of the attraction
-        if self.attraction is not None:
-            self._attracted = momentum = self.contact_map.momenta(along_normal(-self.attraction))
+        self._given: Floats | float = 0.0  #: mass-scaled momenta of what is no part of the cone problem
+        self.later: Floats | None = None
+        self.landing = landing(world, contacts, self.contact_map, free, freely, last, dt)
+        known = self.attraction is not None or self.landing is not None
+        if known:
+            self._given = momentum = self.contact_map.momenta(self.net(np.zeros_like(last)))
             self.free_velocity = self.velocity_with(momentum)
             freely += self.contact_map.velocities(momentum)
+        if self.landing is not None:
+            b += self.landing.before * self.compliance[:, [0, 1, 1]]
         self.resistance = resistance(world, contacts, state, self.contact_map, self.frame, free)
         self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
-        if self.resistance is not None and self.attraction is not None:
+        if self.resistance is not None and known:
             self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
         self.at_once = 0
         self._bounces = np.zeros(len(contacts), np.bool_)
@@ -166,7 +174,8 @@ class ContactSystem:
         (owned, 6). Collective."""
         change, push = None, motion.push
         if push is None and world.turns_unlike_spheres:
-            push = self.contact_map.momenta(self.net(last))
+            pull = 0.0 if self.attraction is None else along_normal(self.attraction)
+            push = self.contact_map.momenta(last - pull)
         if push is not None:
             change = _expected(self.contact_map.source.root, push, self.dt)
         coupling = motion.coupling
@@ -257,7 +266,7 @@ class ContactSystem:
     def held_after(self, impulse: Floats) -> Floats:
         """Impulses of the step (parts nc, 3), see `ContactLaw.parts`, with what tangential springs hold at its end
         in the place of the tangential ones [N s]."""
-        return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, impulse)
+        return stiffness.held_after(self.stiffness, self.compliance, self.dt, self.held, self._with_borne(impulse))
 
     def keep(self, world: World, impulse: Floats, momentum: Floats) -> Floats:
         """What the laws of contact keep (nc, columns) for the next step, for the impulses (parts nc, 3) of the cone
@@ -267,17 +276,29 @@ class ContactSystem:
         count = len(self.key)
         impulse, change = impulse[:count], self.problem_map.velocities(momentum.reshape(-1, 6))[:count]
         slip = (self.r + change)[:, 1:] + self.compliance[:, 1:] * impulse[:, 1:]
+        impulse = self._with_borne(impulse)
         return world.pairs.keep(self.contact_state, self.past, Solved(impulse, self.mu, np.hypot(*slip.T)))
 
     def net(self, impulse: Floats) -> Floats:
         """What contacts do to bodies (nc, 3) whose impulses in the friction cones (nc, 3) are these [N s]."""
+        impulse = self._with_borne(impulse)
         return impulse if self.attraction is None else impulse - along_normal(self.attraction)
+
+    def _with_borne(self, impulse: Floats) -> Floats:
+        """Impulses in the friction cones (parts nc, 3) with what contacts bear before bodies land."""
+        if self.landing is None:
+            return impulse
+        impulse = impulse.copy()
+        impulse[: len(self.key)] += self.landing.before
+        return impulse
 
     def parts(self, impulse: Floats) -> tuple[Floats, Floats | None]:
         """What contacts do to bodies (nc, 3), and their moments (nc, 3) where they resist rolling, for the impulses
         (parts nc, 3) of the cone problem [N s]."""
         count = len(self.key)
-        return self.net(impulse[:count]), None if self.resistance is None else impulse[count:]
+        net = self.net(impulse[:count])
+        net = net if self.later is None else net + self.later
+        return net, None if self.resistance is None else impulse[count:]
 
     def velocity(self, impulse: Floats) -> Floats:
         """Velocities (owned, 6) after the step, v_free + M^-1 D g, for impulses (nc, 3); collective."""
@@ -289,20 +310,26 @@ class ContactSystem:
         self.contact_map.mass.scale(momentum.reshape(-1, 6), change)
         return self.free_velocity + change
 
-    def kept(self, velocity: Floats) -> Floats | None:
-        """The velocities (owned, 6) with which bodies go into the next step, where those of this one are `velocity`:
-        others of bodies that are no spheres, see `dem.free_motion.kept_velocities`; None: the same."""
-        if self.middle is None:
-            return None
-        table = self.near.bodies
-        return kept_velocities(table.quaternion, velocity, self.middle, table.inertia, self.dt)
+    def kept(self, velocity: Floats, impulse: Floats) -> Floats | None:
+        """The velocities (owned, 6) with which bodies go into the next step, where those of this one are `velocity`,
+        and impulses in the friction cones (parts nc, 3): others of bodies that are no spheres, see
+        `dem.free_motion.kept_velocities`, and of those that land; None: the same. Collective."""
+        kept, table = None, self.near.bodies
+        if self.middle is not None:
+            kept = kept_velocities(table.quaternion, velocity, self.middle, table.inertia, self.dt)
+        if self.landing is None:
+            return kept
+        self.later = self.landing.rest(impulse[: len(self.key)], self.contact_map.body, len(table.mass))
+        momentum, change = self.contact_map.momenta(self.later), np.empty(velocity.shape)
+        self.contact_map.mass.scale(momentum.reshape(-1, 6), change)
+        return (velocity if kept is None else kept) + change
 
     def set_rate(self, world: World, momentum: Floats) -> None:
         """Give a cell that deforms the rate of its periods in this step, for the momenta of `velocity_with`;
         collective."""
         mass = self.contact_map.mass
         if isinstance(mass, CellMass):
-            rate = mass.rate_of(momentum.reshape(-1, 6) + self._attracted)
+            rate = mass.rate_of(momentum.reshape(-1, 6) + self._given)
             world.cell = replace(world.cell, rate=mass.cell.free + rate)
 
     def take_flow(self, world: World, contacts: Contacts) -> None:

@@ -149,7 +149,7 @@ class Stepper:
         _refuse_squeezed(world, result)
         with log.phase("advance"):
             system.take_flow(world, contacts)
-            advance(world, free, contacts, velocity, system.kept(velocity))
+            advance(world, free, contacts, velocity, system.kept(velocity, result.impulse))
             step = Step(world, contacts, system, *system.parts(result.impulse))
             held, kept = system.held_after(result.impulse), system.keep(world, result.impulse, result.momentum)
         return NewStep(step, self._figures(world, problem.size, result, files), held, kept)

@@ -39,7 +39,7 @@ def test_a_turntable_carries_a_block_while_friction_can_hold_it(solver):
     for step in steps(world, count, dt, solver):
         used = step.friction_used()
         x, y, z = world.grains.position[0]
-        assert x + 1j * y == pytest.approx(radius * np.exp(1j * speed * world.time), abs=1e-7)
+        assert x + 1j * y == pytest.approx(radius * np.exp(1j * speed * world.time), abs=5e-7)
         assert z == pytest.approx(HALF[2], abs=1e-7)
         np.testing.assert_allclose(world.grains.velocity[0, 3:], [0, 0, speed], atol=1e-5)
     assert used == pytest.approx(speed**2 * radius / G, rel=0.02)
@@ -63,25 +63,25 @@ def test_a_sphere_on_a_turntable_circles_at_two_sevenths_of_its_speed():
         for _ in steps(world, round(time / dt), dt):
             assert world.grains.position[0, 2] == pytest.approx(RADIUS, abs=1e-8)
         errors.append(np.linalg.norm(world.grains.position[0, :2] - expected))
-    assert errors[1] < 0.01 * radius
-    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.05)
+    assert errors[1] < 1e-4 * radius
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_a_paddle_gives_a_sphere_its_velocity(solver, friction):
-    """A turning paddle hits a sphere at rest: the point of contact takes the normal velocity of the face, which has the
-    direction of the end of the step."""
+    """A turning paddle hits a sphere at rest, which it does not touch before: the point of contact takes the normal
+    velocity of the face, which has the direction of the end of the step."""
     speed, arm, dt = 2.0, 0.4, 0.01
     scene = Scene(friction, gravity=(0, 0, 0))
     scene.add_body("paddle", [Box((0.6, 0.02, 0.2))], Rotation((0, 0, speed)))
-    scene.add_spheres([arm, 0.02 + RADIUS, 0], RADIUS, 1000.0)
+    scene.add_spheres([arm, 0.021 + RADIUS, 0], RADIUS, 1000.0)
     world = new_world(scene, MPI.COMM_SELF)
     step = make_steps(world, 1, dt, solver)
     assert len(step.contacts) == 1
     turn = speed * dt
     along, out = np.array([np.cos(turn), np.sin(turn), 0]), np.array([-np.sin(turn), np.cos(turn), 0])
-    start = np.array([arm, 0.02 + RADIUS, 0])
+    start = np.array([arm, 0.021 + RADIUS, 0])
     arm, gap = along @ start, out @ start - 0.02 - RADIUS  # at the end
     np.testing.assert_allclose(step.contacts.normal[0], -out, atol=1e-12)
     start -= (RADIUS + gap + turn * arm) * out  # the place of contact on the paddle, which then goes with it

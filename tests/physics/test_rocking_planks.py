@@ -1,4 +1,4 @@
-"""Planks rock on logs, and balls roll on planks that turn: nothing brakes them."""
+"""Planks rock on logs, balls roll on what turns, and blocks rock from edge to edge: only impacts brake them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 
 from dem import quaternion
-from dem.motion import Dynamic
+from dem.motion import Dynamic, Rotation
 from dem.scene import Scene
 from dem.shapes import Box, Capsule, Cylinder, Mesh, Plane, Sphere
 from pctt.simulation import Simulation
@@ -100,3 +100,39 @@ def test_a_ball_rolls_on_a_plank_that_turns():
     error, spin = seesaw(1.0, 0.004)
     assert spin > 10.0
     assert abs(error) < 1.5e-3
+
+
+def test_a_ball_on_a_turntable_goes_on_a_circle():
+    """By the default step it keeps its speed, and turns by 2/7 of the angle of the table (Weckesser 1997)."""
+    scene = Scene(1.0)
+    scene.add_body("table", [Plane((0, 0, 1))], Rotation((0, 0, 2.0)))
+    scene.add_spheres([[1.0, 0, 0.05]], 0.05, 2500.0, velocity=(0.0, 0.5, 0.0))
+    sim = Simulation(scene, comm=MPI.COMM_SELF)
+    sim.run(until=0.5)  # it slips no more
+    time, first = sim.time, complex(*sim.velocities[0, :2])
+    sim.run(until=3.5)
+    last = complex(*sim.velocities[0, :2])
+    assert abs(last / first - np.exp(2j / 7 * 2.0 * (sim.time - time))) < 1e-3
+
+
+@pytest.mark.parametrize("tilt", [0.1, 0.11, 0.15])
+def test_a_block_rocks_as_housner_says(tilt):
+    """By the default step: each landing leaves (1 - 3/2 sin^2 alpha)^2 of the energy. Of these starts the first lands
+    at the end of a step, the second at the start of one."""
+    half, high = 0.1, 0.4
+    steep, reach = np.arctan2(half, high), np.hypot(half, high)
+    scene = Scene(1.0)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    place = [half - reach * np.sin(steep - tilt), 0, reach * np.cos(steep - tilt)]
+    scene.add_boxes([place], (half, 0.2, high), 1000.0, quaternions=[(np.cos(tilt / 2), 0, np.sin(tilt / 2), 0)])
+    sim, angles = Simulation(scene, comm=MPI.COMM_SELF), []
+    while sim.time < 2.0:
+        sim.step()
+        angles.append(2 * np.arctan2(sim.orientations[0, 2], sim.orientations[0, 0]))
+    angle = np.array(angles)
+    lands = np.flatnonzero((angle[1:] < 0) != (angle[:-1] < 0))
+    left = np.cos(steep - tilt) - np.cos(steep)
+    for start, end in zip(lands[:2], lands[1:]):
+        left *= (1 - 1.5 * np.sin(steep) ** 2) ** 2
+        peak = steep - np.arccos(np.cos(steep) + left)
+        assert np.abs(angle[start : end + 1]).max() == pytest.approx(peak, rel=0.01)

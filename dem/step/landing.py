@@ -1,0 +1,97 @@
+"""What contacts bear until a body lands within a step.
+
+A step solves all contacts at once. Where a body lands on a second support and leaves the first one, as a block that
+rocks from edge to edge, the second would bear its weight from the start of the step, and the first none of it: a loss
+of speed of first order in the step. Velocities are those of the middle between two steps, so an impact at the time
+s dt comes (1/2 + s) dt after those before. Until then contacts go on to bear what they bore in the last step, 1/2 + s
+times that: what is more than once of it they bear in the next step, in which they are open. The step finds what they
+bear beside that.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from dem.arrays import Bools, Floats, Ints
+from dem.bodies import BOX, CONVEX, POLYHEDRON
+from dem.compiled import loop
+from dem.exchange import on_any
+from dem.model.world import World
+from dem.shapes import Capsule, Convex, Sphere
+
+if TYPE_CHECKING:
+    from dem.contact import Contacts
+    from dem.contact_map import ContactMap
+
+MOST = 2.0  #: normal impulses of a body over those of the forces on it, above which it was struck in the last step
+SLOW = 0.5  #: of the speed that forces give in a step, at which contacts close that take over a load as bodies roll
+LEFT = 0.01  #: of what a contact bears before, which it bears beside that where it opens
+
+
+class Landing(NamedTuple):
+    """What contacts with bodies that forces do not move bear until others of the same body close."""
+
+    before: Floats  #: (nc, 3) in this step [N s]
+    after: Floats  #: (nc, 3) in the next one, if they open [N s]
+    lands: Bools  #: (nc,) contacts that close
+
+    def rest(self, impulse: Floats, body: np.ndarray, rows: int) -> Floats:
+        """What contacts bear in the next step (nc, 3) that have opened, where `impulse` (nc, 3) are those beside
+        `before` and `body` (nc, 2) the bodies, in so many rows."""
+        landed = np.zeros(rows, np.bool_)
+        landed[body[self.lands & (impulse[:, 0] > 0.0)]] = True
+        left = landed[body].any(axis=1) & (impulse[:, 0] <= LEFT * self.before[:, 0])
+        return np.where(left[:, None], self.after, 0.0)
+
+
+def landing(
+    world: World, contacts: Contacts, contact_map: ContactMap, free: Floats, freely: Floats, last: Floats, dt: float
+) -> Landing | None:
+    """Find what contacts bear until bodies land; None if none bears any that may. Bodies have the velocities `free`
+    (rows, 6) without contacts, contacts `freely` (nc, 3) [m/s], and `last` (nc, 3) are the impulses of the last step;
+    collective. Contacts of bodies that are round somewhere go from place to place without impacts: they are left out.
+    """
+    table, gap = contacts.near.bodies, contacts.linear_gap
+    push = np.linalg.norm(free[:, :3] - table.velocity[:, :3], axis=1)
+    body, bears = _bearing(contacts.a, contacts.b, (table.mass, push), gap, freely, last, dt)
+    if not on_any(contact_map.comm, bool(bears.any()))[0]:
+        return None
+    smooth = (table.shape != BOX) & ((table.shape < POLYHEDRON) | (table.shape >= CONVEX))
+    first = contacts.near.grains + contacts.near.ghosts
+    round_parts = Sphere, Capsule, Convex
+    smooth[first:] = [any(isinstance(part, round_parts) for part in large.shapes) for large in world.large_bodies]
+    bears &= ~smooth[body]
+    whole = np.where(bears[:, None], last, 0.0)
+    speed = -dt * (freely[:, 0] + contact_map.velocities(contact_map.momenta(whole))[:, 0])
+    lands = (body >= 0) & (last[:, 0] == 0.0) & (gap > 0.0) & (speed > gap)
+    lands &= speed > SLOW * dt * push[body]
+    time = np.full(len(table.mass), np.inf)
+    np.minimum.at(time, body[lands], gap[lands] / speed[lands])
+    part = np.where(time < 1.0, 0.5 + time, 0.0)[body][:, None]
+    return Landing(whole * np.minimum(part, 1.0), whole * np.maximum(part - 1.0, 0.0), lands)
+
+
+@loop
+def _bearing(
+    a: Ints, b: Ints, laws: tuple[Floats, Floats], gap: Floats, freely: Floats, last: Floats, dt: float
+) -> tuple[Ints, Bools]:
+    """Of contacts (nc,) with a body that forces do not move, the row of the other, else -1; and which of them bore in
+    the last step, where another one of that body may close in this one. Bodies have masses, and forces add to their
+    speeds (rows,)."""
+    mass, push = laws
+    body, bears = np.full(len(a), -1), np.zeros(len(a), np.bool_)
+    lands, load = np.zeros(len(mass), np.bool_), np.zeros(len(mass))
+    for c in range(len(a)):
+        one, other = np.isfinite(mass[a[c]]), np.isfinite(mass[b[c]])
+        if one == other:
+            continue
+        n = a[c] if one else b[c]
+        body[c] = n
+        load[n] += last[c, 0]
+        lands[n] |= last[c, 0] == 0.0 and gap[c] > 0.0 and gap[c] + dt * freely[c, 0] < 0.0
+    for c in range(len(a)):
+        n = body[c]
+        bears[c] = n >= 0 and lands[n] and last[c, 0] > 0.0 and load[n] <= MOST * mass[n] * push[n]
+    return body, bears
