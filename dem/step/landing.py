@@ -53,6 +53,8 @@ def landing(
     (rows, 6) without contacts, contacts `freely` (nc, 3) [m/s], and `last` (nc, 3) are the impulses of the last step;
     collective. Contacts of bodies that are round somewhere go from place to place without impacts: they are left out.
     """
+    if world.only_spheres and not world.large_moves:
+        return None
     table, gap = contacts.near.bodies, contacts.linear_gap
     push = np.linalg.norm(free[:, :3] - table.velocity[:, :3], axis=1)
     body, bears = _bearing(contacts.a, contacts.b, (table.mass, push), gap, freely, last, dt)
