@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dem.arrays import Floats
+from dem.arrays import Floats, sum_of
 from dem.compiled import PART, inlined, inner, loop, prange
 
 NUMBERS = 1536  # that stay in the nearest cache, of loops that become vectors
@@ -417,16 +417,14 @@ def energy_of_step(mass, new_m, m, last_m, beta):
 
 @inner
 def _energy_of_part(mass, new_m, m, last_m, beta):
-    energy = 0.0
     if mass.shape[1] == 6:
         each, new, now, last = mass.ravel(), new_m.ravel(), m.ravel(), last_m.ravel()
-        sums = np.zeros(NUMBERS, mass.dtype)
+        sums = np.zeros(min(NUMBERS, (len(each) + 7) // 8 * 8), mass.dtype)
         for a in range(0, len(each), NUMBERS):
             b = min(a + NUMBERS, len(each))
             _add_energies(each[a:b], new[a:b], now[a:b], last[a:b], beta, sums)
-        for k in range(len(sums)):
-            energy += sums[k]
-        return energy
+        return sum_of(sums)
+    energy = 0.0
     for i in range(len(mass)):
         u, v, w, x, y, z = extrapolated(m, last_m, beta, i)
         d0, d1, d2 = new_m[i, 0] - u, new_m[i, 1] - v, new_m[i, 2] - w

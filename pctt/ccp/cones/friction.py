@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dem.arrays import sum_of
 from dem.compiled import PART, inlined, inner, loop, prange
 from pctt.arrays import Array, tangential
 from pctt.ccp.cones.base import Cones, Units, floats
@@ -104,19 +105,6 @@ def _room(count, most):
 
 
 @inner
-def sum_of(x):
-    """The sum of numbers, of eight side by side in each of their pieces."""
-    total = 0.0
-    for first in range(0, len(x), PIECE):
-        s = x[first : first + 8].copy()
-        for a in range(first + 8, first + PIECE, 8):
-            for k in range(8):
-                s[k] += x[a + k]
-        total += ((s[0] + s[1]) + (s[2] + s[3])) + ((s[4] + s[5]) + (s[6] + s[7]))
-    return total
-
-
-@inner
 def in_units(x, y, unit, size, g, v):
     for k in range(len(x)):
         g[k], v[k] = x[k] * (unit / size[k]), y[k] * (unit * size[k])
@@ -181,7 +169,7 @@ def accelerated_step(
             add_products(to[a:b], x[a:b], y_z, products)
             if soft:
                 add_work(to[a:b], z, compliance[a:b], work)
-        sums[k] = work.sum(), squares.sum(), products.sum()
+        sums[k] = sum_of(work), sum_of(squares), sum_of(products)
     total_work, square, product = 0.0, 0.0, 0.0
     for k in range(len(sums)):
         total_work, square, product = total_work + sums[k, 0], square + sums[k, 1], product + sums[k, 2]

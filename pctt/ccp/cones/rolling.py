@@ -21,6 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dem.arrays import sum_of
 from dem.compiled import inlined, inner, loop
 from pctt.arrays import Array, tangential
 from pctt.ccp.cones.base import Cones, Units, floats
@@ -36,7 +37,6 @@ from pctt.ccp.cones.friction import (
     add_work,
     extrapolate,
     in_units,
-    sum_of,
 )
 
 
@@ -193,7 +193,7 @@ def accelerated_step(
         add_products(new_turned, x[moments], turning, products)
         if soft:
             add_work(new, z, compliance[forces], work)
-    return work.sum(), squares.sum(), products.sum()
+    return sum_of(work), sum_of(squares), sum_of(products)
 
 
 @loop
