@@ -8,7 +8,7 @@ from typing import Any, Union
 import numpy as np
 from numpy.typing import NDArray
 
-from dem.compiled import inlined, inner, loop
+from dem.compiled import inlined, loop
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -86,18 +86,6 @@ ArrayLike = Union[float, Sequence[float], Sequence[Sequence[float]], Floats, Rul
 
 #: The lower and the upper corner of a box [m].
 Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
-
-
-@inner
-def sum_of(x):
-    """The sum (double precision) of a whole number of eights, eight sums side by side: one after the other each would
-    wait for the last."""
-    zero = x.dtype.type(0)
-    a, b, c, d, e, f, g, h = zero, zero, zero, zero, zero, zero, zero, zero
-    for k in range(0, len(x), 8):
-        a, b, c, d = a + x[k], b + x[k + 1], c + x[k + 2], d + x[k + 3]
-        e, f, g, h = e + x[k + 4], f + x[k + 5], g + x[k + 6], h + x[k + 7]
-    return np.float64((a + e) + (b + f)) + np.float64((c + g) + (d + h))
 
 
 @inlined

@@ -21,8 +21,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dem.arrays import sum_of
 from dem.compiled import inlined, inner, loop
+from dem.contact_map.loops import sum_of
 from pctt.arrays import Array, tangential
 from pctt.ccp.cones.base import Cones, Units, floats
 from pctt.ccp.cones.friction import (
