@@ -402,8 +402,9 @@ def greatest_speed(velocity: Floats, center: Floats, point: Floats, radius: Floa
 
 def swing(motion: Motion) -> float:
     """The angular frequency [rad/s] with which a motion swings; 0 of those that do not."""
-    swings = isinstance(motion, Oscillation) and motion.amplitude != 0.0
-    return 2.0 * np.pi / motion.period if swings else 0.0
+    if not isinstance(motion, Oscillation) or motion.amplitude == 0.0:
+        return 0.0
+    return 2.0 * np.pi / motion.period
 
 
 def changed(motion: Motion, time: float, **values: Any) -> Motion:
