@@ -400,6 +400,13 @@ def greatest_speed(velocity: Floats, center: Floats, point: Floats, radius: Floa
     return float(np.linalg.norm(velocity[:3]) + around.max())
 
 
+def swing(motion: Motion) -> float:
+    """The angular frequency [rad/s] with which a motion swings; 0 of those that do not."""
+    if not isinstance(motion, Oscillation) or motion.amplitude == 0.0:
+        return 0.0
+    return 2.0 * np.pi / motion.period
+
+
 def changed(motion: Motion, time: float, **values: Any) -> Motion:
     """The motion with other parameters from `time` [s] on. An oscillation of another period stays in its phase, unless
     a phase is given. ValueError for a parameter that the motion does not have, or a bad value."""

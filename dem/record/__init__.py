@@ -183,10 +183,15 @@ def energy_balance(step: Step) -> dict[str, float]:
 
 
 def _bounced_work(step: Step) -> float:
-    """What loads and springs do on the way of grains that ends beside that of their mean velocities, as impacts are
-    within the step [J]: bodies that come and go as fast may have fallen in between."""
-    applied, lag = step.system.applied, step.contacts.lag
-    return 0.0 if applied is None or lag is None else float(np.vdot(applied.grains[:, :3], lag)) / step.system.dt
+    """What gravity, loads and springs do on the way of grains that ends beside that of their mean velocities, as
+    impacts are within the step [J]: bodies that come and go as fast may have fallen in between."""
+    applied, lag, near = step.system.applied, step.contacts.lag, step.contacts.near
+    if lag is None:
+        return 0.0
+    force = near.bodies.mass[: near.grains, None] * step.world.gravity
+    if applied is not None:
+        force = force + applied.grains[:, :3] / step.system.dt
+    return float(np.vdot(force, lag))
 
 
 #: What `energy_balance` adds up over the ranks: what `_ledger` returns, `elastic_energies`, and the works.

@@ -1,8 +1,8 @@
 """The time step and the contact distance that a scene needs, from its sizes and speeds.
 
-Three times matter: that in which the fastest tool goes a radius, that in which a grain falls about half of one,
-sqrt(R / g), and that in which a body that is no sphere turns by a radian. docs/choose.md has the errors of forces on
-tools over dt.
+Four times matter: that in which the fastest tool goes a radius, that in which a grain falls about half of one,
+sqrt(R / g), that in which a tool swings by a radian of its phase, and that in which a body that is no sphere turns by
+one. docs/choose.md has the errors of forces on tools over dt.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from dem import bodies, quaternion
 from dem.arrays import Floats
 from dem.contact.primitives import extents
-from dem.motion import greatest_speed, top_speed
+from dem.motion import greatest_speed, swing, top_speed
 from dem.parts.named import Pressing
 from dem.scene import LargeBody, Scene
 from dem.shapes import Plane, outline
@@ -31,9 +31,9 @@ PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same an
 
 def recommended(scene: Scene) -> float:
     """Return the time step [s] with which forces on tools are within a few per cent of those of smaller steps, grains
-    that fall go no further than FALLS of their half thicknesses, bodies that are no spheres turn by no more than TURN
-    at time zero, and the contacts of those that topple are foreseen, to two digits; 0.01 s for a scene without all
-    that."""
+    that fall go no further than FALLS of their half thicknesses, tools that swing go on by no more than TURN of their
+    phase, bodies that are no spheres turn by no more than TURN at time zero, and the contacts of those that topple are
+    foreseen, to two digits; 0.01 s for a scene without all that."""
     return min(needs(scene).values())
 
 
@@ -52,6 +52,8 @@ def needs(scene: Scene) -> dict[str, float]:
     found |= {what: _rounded(dt) for what, dt in scene.cell.needs(scene.expected()).items()}
     if (spin := fastest_turn(scene)) > 0.0:
         found[f"bodies that turn at {spin:.3g} rad/s"] = _rounded(TURN / spin)
+    if (swings := fastest_swing(scene)) > 0.0:
+        found[f"tools that swing with {swings:.3g} rad/s"] = _rounded(TURN / swings)
     if (toppled := toppling(scene)).dt < np.inf:
         found[f"bodies that topple to {toppled.turn.max():.3g} rad/s"] = _rounded(toppled.dt)
     return found | {what: _rounded(step) for what, step in pressed.steps}
@@ -118,6 +120,11 @@ def fastest_turn(scene: Scene) -> float:
     grains, large = bodies.turning(scene.expected()), turning_of_large(scene.large(), scene.large_bodies)
     held = [turning_of_grains(scene.row(id), [id]) for id in held_beside(scene.named)]
     return float(np.concatenate([grains, large, *held]).max(initial=0.0))
+
+
+def fastest_swing(scene: Scene) -> float:
+    """Return the greatest angular frequency of a tool that stays with the grains [rad/s]."""
+    return max((swing(body.motion) for body in scene.large_bodies if body.name not in scene.leaving), default=0.0)
 
 
 def _fall(scene: Scene) -> float:

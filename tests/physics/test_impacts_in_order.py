@@ -132,6 +132,17 @@ def test_a_ball_keeps_its_height_where_nothing_is_lost():
     assert max(energy) == pytest.approx(min(energy), rel=1e-2)
 
 
+@pytest.mark.parametrize("height", [0.5, 1.1, 2.0])
+def test_a_ball_that_bounces_is_no_jump_of_energy(height):
+    """What falls and rises within a step gets its speed from gravity, also in steps as long as the defaults."""
+    scene = Scene(friction=0.3, restitution=1.0)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    scene.add_spheres([[0, 0, (1 + height) * R]], R, DENSITY)
+    with pctt.Simulation(scene, comm=MPI.COMM_SELF) as sim:
+        for _ in range(200):
+            assert sim.step()["energy_jump"] == 0.0
+
+
 @pytest.mark.parallel(2)
 def test_ranks_follow_the_same_impacts(ranks):
     """A gas of 50 spheres in a periodic box."""

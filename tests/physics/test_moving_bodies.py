@@ -7,11 +7,13 @@ import pytest
 from drive import RADIUS, SOLVERS, G, make_steps, steps
 from mpi4py import MPI
 
+import pctt
 from dem import quaternion
 from dem.motion import Oscillation, Rotation, mean_velocity
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
+from dem.start.time_step import needs, recommended
 
 HALF = (0.04, 0.03, 0.02)  #: of the block that rides on the turntable
 
@@ -116,3 +118,33 @@ def test_an_oscillating_wall_pushes_a_sphere_and_lets_it_go_at_its_greatest_spee
         np.testing.assert_allclose(world.grains.velocity[0], [fastest, 0, 0, 0, 0, 0], atol=1e-7)
     assert fastest == pytest.approx(2 * np.pi * 0.1 / 0.8, rel=2e-3)
     assert world.large.position[0, 0] + RADIUS < world.grains.position[0, 0] - 0.03
+
+
+def shaken(amplitude, frequency, radius):
+    """A sphere on a plate that shakes upwards and downwards, with the speed of the plate."""
+    scene, turning = Scene(0.3), 2 * np.pi * frequency
+    scene.add_body("plate", [Plane((0, 0, 1))], Oscillation((0, 0, 1), amplitude, 1 / frequency))
+    scene.add_spheres([0, 0, radius], radius, 1000.0, velocity=(0, 0, amplitude * turning))
+    return scene, turning
+
+
+@pytest.mark.parametrize(("radius", "frequency"), [(0.1, 20.0), (0.005, 50.0)])
+def test_the_default_step_resolves_a_plate_that_shakes(radius, frequency):
+    """The force on it swings by the mass times its acceleration; with steps for the speeds alone by 4 to 14 % less."""
+    amplitude = 0.5 * G / (2 * np.pi * frequency) ** 2
+    scene, turning = shaken(amplitude, frequency, radius)
+    assert recommended(scene) == pytest.approx(0.2 / turning, rel=0.1)
+    force = []
+    with pctt.Simulation(scene, comm=MPI.COMM_SELF) as sim:
+        sim.run(until=1 / frequency)
+        sim.run(until=4 / frequency, call=lambda sim: force.append(sim.body("plate").force[2]))
+        mass = scene.row(0).mass[0]
+    assert np.std(force) * np.sqrt(2) == pytest.approx(0.5 * mass * G, rel=0.035)
+
+
+def test_what_does_not_swing_or_leaves_asks_for_no_smaller_step():
+    rests, _ = shaken(0.0, 20.0, 0.1)
+    leaves, _ = shaken(0.0002, 20.0, 0.1)
+    leaves.leaving = {"plate"}
+    for scene in (rests, leaves):
+        assert not any("swing" in what for what in needs(scene))
