@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 from dem.arrays import Floats, Ints
 from dem.contact_map import loops
-from dem.contact_map.rows import BlockRows, CompactRows, root_blocks
+from dem.contact_map.rows import BlockRows, CompactRows
 from dem.exchange import offsets
 
 Mass = TypeVar("Mass", bound="InverseMass")
@@ -112,7 +112,7 @@ class ConstrainedMass(InverseMass):
         self.shared = len(coupling) // 6
         self.unshared = self.square.copy()
         self.unshared[here] = 0.0
-        self._root = root_blocks(root[here])
+        self._given = root[here]
 
     def uncoupled(self, z: Floats) -> Floats:
         """(I - K) z for z (shared, 6) of all constrained bodies."""
@@ -121,9 +121,14 @@ class ConstrainedMass(InverseMass):
 
     def gathered(self, v: Floats) -> Floats:
         """The rows (shared, 6) of the constrained bodies among those v (columns, 6) of all ranks; collective."""
+        return self._all(v[self.here])
+
+    def _all(self, own: Floats) -> Floats:
+        """The rows (shared, 6) of all constrained bodies from the own ones (k, 6); collective."""
         out = np.zeros((self.shared, 6))
-        out[self.slot] = v[self.here]
-        self.comm.Allreduce(MPI.IN_PLACE, out)
+        out[self.slot] = own
+        if self.comm.size > 1:
+            self.comm.Allreduce(MPI.IN_PLACE, out)
         return out
 
     def held(self, v: Floats) -> Floats:
@@ -139,19 +144,16 @@ class ConstrainedMass(InverseMass):
         return self.held(super().momenta(m, pushed))
 
     def share(self, m: Floats, pushed: Floats, s: Floats) -> None:
-        own = self._scaled(m[self.here])
-        out = np.zeros((self.shared, 6))
-        out[self.slot] = own
-        self.comm.Allreduce(MPI.IN_PLACE, out)
-        s[:] = out
+        s[:] = self._all(self._scaled(m[self.here]))
 
     def add_bodies(self, s: Floats, w: Floats) -> None:
         w[self.here] += self._scaled(self.uncoupled(self.uncoupled(s))[self.slot])
 
     def _scaled(self, m: Floats) -> Floats:
         """R m (k, 6) of the own constrained bodies."""
-        both = np.einsum("npij,npj->npi", self._root, m.reshape(-1, 2, 3))
-        return both.reshape(-1, 6)
+        out = np.empty((len(m), 6))
+        loops.scale(self._given, m.astype(float, copy=False), out)
+        return out
 
     def energy(self, s: Floats) -> float:
         z = self.uncoupled(s)
