@@ -66,6 +66,7 @@ LEAST_COSINE = 0.9  #: of the angle by which the normal of a contact may turn un
 #: is the guest.
 RANK = np.array([0, 3, 9, 1, 5, 6, 4, 2])
 
+Vector = tuple[float, float, float]
 Forms = tuple[Ints, Ints, Floats, Floats]  #: kind, row, size, radius of `dem.contact.primitives.Primitives`
 Poses = tuple[Floats, Floats]  #: their centres and quaternions
 
@@ -130,101 +131,172 @@ def turn_ahead(
     have a gap that is wider than the reach of their pair.
 
     `arcs` (nc, 4, 3) are as of `dem.contact.convex.arcs_of`; empty without such shapes."""
-    (kind, row, size, _), (center, quaternion) = forms, poses
-    (place, velocity, moves, dt), (i, j, pair, reach), (point, normal, gap, lasting) = course, pairs, touch
+    (kind, row, size, _), (center, quaternion), (place, _, _, dt) = forms, poses, course
+    (i, j, pair, reach), (point, normal, gap, lasting) = pairs, touch
     moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
     deep, found, wide = np.empty(len(pair), np.int64), 0, 0
     for c in range(len(pair)):
         one, two = i[pair[c]], j[pair[c]]
         swap = guest_is_second(kind[one], kind[two])
-        a, b = (two, one) if swap else (one, two)
-        A, B, sign = row[a], row[b], -1.0 if swap else 1.0
-        V, u = vector_of(velocity[A], 0), vector_of(velocity[A], 3)
-        W, w = vector_of(velocity[B], 0), vector_of(velocity[B], 3)
-        h, _ = ahead_by(a, b, forms, poses, inner, course)
-        here = kind[a] == SPHERE and kind[b] in (SPHERE, PLANE, BOX)
-        core = size[a, 0] if kind[a] in (SPHERE, CAPSULE) else 0.0  # its surface turns with the normal, not with a body
-        under = size[b, 0] if kind[b] in (SPHERE, CAPSULE) else 0.0
-        flat = under == 0.0
+        a, b, sign = (two, one, -1.0) if swap else (one, two, 1.0)
+        A, B = row[a], row[b]
+        guest, host = _side(a, forms, poses, course), _side(b, forms, poses, course)
         apart = plus(place[A], -1.0, place[B])
+        h, _ = ahead_by(a, b, forms, poses, inner, course)
+
+        # The end: its normal and gap, and the arms there.
+        here = guest.kind == SPHERE and host.kind in (SPHERE, PLANE, BOX)  # found where the bodies are
+        as_found = sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]
         if here:
-            lever, other = plus(center[a], -1.0, place[A]), plus(center[b], -1.0, place[B])
-            ahead, beside = after_turn(lever, u, h), after_turn(other, w, h)
-            end = plus(plus(plus(plus(center[a], -1.0, center[b]), h, V), -h, W), -1.0, beside)
-            end = plus(plus(end, 1.0, plus(ahead, -1.0, lever)), 1.0, other)
-            n, after = _from_host(end, kind[b], quaternion[b], size[b], core, w, h)
-            their = plus(plus(other if kind[b] == SPHERE else beside, 1.0, end), core + after, n)
-            own, inside = plus(lever, core, n), lever
+            between = plus(center[a], -1.0, center[b])
+            n, end, arm, other = _turned_to_end(guest, host, between, h, quaternion[b], size[b])
         else:
-            n = after_turn((sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]), w, h)
-            middle, after = after_turn(plus(point[c], -1.0, place[B]), w, h), gap[c]
-            own = plus(plus(plus(middle, -0.5 * after, n), -1.0, apart), h, plus(W, -1.0, V))
-            their = plus(middle, 0.5 * after, n)
-        start = of_start(lasting, c, sign)
-        given = not (moves[A] and moves[B])
-        if here and given and gap[c] <= CLOSE * core:
-            start = sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]
-        lasts = dot(start, start) > 0.0
-        if not lasts:
-            start = n
-        # From what turns with the bodies to their surfaces, at the end and at the start.
-        arc, bow = (core * n[0], core * n[1], core * n[2]), (-under * n[0], -under * n[1], -under * n[2])
-        first_arc = core * start[0], core * start[1], core * start[2]
-        first_bow = -under * start[0], -under * start[1], -under * start[2]
-        if kind[a] >= CONVEX:
-            arc, first_arc = vector_of(arcs[c, 0], 0), vector_of(arcs[c, 1], 0)
-        if kind[b] >= CONVEX:
-            bow, first_bow = vector_of(arcs[c, 2], 0), vector_of(arcs[c, 3], 0)
-            flat = dot(bow, bow) == 0.0
-        if not here:
-            inside = after_turn(plus(own, -1.0, arc), u, -h)
+            n, end, arm, other = _found_at_end(guest, host, apart, h, as_found, plus(point[c], -1.0, place[B]), gap[c])
         if h == 0.0 or dot(n, n) == 0.0:
             continue
+
+        # What rolls, and which contacts keep the normal of the start.
+        given, start = not (guest.moves and host.moves), of_start(lasting, c, sign)
+        if here and given and gap[c] <= CLOSE * guest.radius:
+            start = as_found
+        lasts = dot(start, start) > 0.0
+        start = start if lasts else n
+        arc, first_arc = _arcs(guest, 1.0, n, start, arcs, c, 0)
+        bow, first_bow = _arcs(host, -1.0, n, start, arcs, c, 2)
+        flat = dot(bow, bow) == 0.0
         lasts &= given or (flat and dot(arc, arc) > 0.0)
         n = start if lasts else n
-        below = plus(center[b], -1.0, place[B]) if kind[b] == SPHERE else after_turn(plus(their, -1.0, bow), w, -h)
-        if moves[A] or lasts:
-            own = plus(inside, 1.0, first_arc)
-            if flat:
-                below = plus(own, 1.0, apart)  # the two arms lead to one place
-        if moves[B] and kind[b] != SPHERE:
-            their = plus(below, 1.0, first_bow)
-        linear[c] = after - h * dot(n, plus(plus(W, 1.0, cross(w, their)), -1.0, plus(V, 1.0, cross(u, own))))
+
+        # The arms of the start; on flat faces both lead to one place.
+        core = guest.center if here else after_turn(plus(arm, -1.0, arc), guest.spin, -h)
+        seat = host.center if host.kind == SPHERE else after_turn(plus(other, -1.0, bow), host.spin, -h)
+        early = guest.moves or lasts
+        if early:
+            arm = plus(core, 1.0, first_arc)
+            seat = plus(arm, 1.0, apart) if flat else seat
+        if host.moves and host.kind != SPHERE:
+            other = plus(seat, 1.0, first_bow)
+        linear[c] = end - h * dot(n, plus(_velocity_at(host, other), -1.0, _velocity_at(guest, arm)))
+        if early and flat:
+            seat = plus(seat, linear[c], n)
+            other = seat if host.moves else other
+
+        own, their = Arms(core, arm, arc, first_arc), Arms(seat, other, bow, first_bow)
+        more = _swing((guest, own), (host, their), n, early, h, dt)
+
         half = 0.5 * min(gap[c] if here else linear[c], 0.0)
-        if (moves[A] or lasts) and flat:
-            below = plus(below, linear[c], n)
-            their = below if moves[B] else their
-        more = plus(_bend(below, w, dt), -1.0, _bend(inside, u, dt))
-        if flat and dot(w, n) != 0.0:
-            # The contact goes along a face that spins; as in the middle of the last step, whose velocities bodies have.
-            slide = plus(_before(V, u, moves[A], dt), 1.0, cross(u, after_turn(inside, u, -0.5 * dt)))
-            slide = plus(slide, 1.0 / h, plus(arc, -1.0, first_arc))
-            slide = plus(slide, -1.0, _before(W, w, moves[B], dt))
-            slide = plus(slide, -1.0, cross(w, after_turn(below, w, -0.5 * dt)))
-            about = plus(_ZERO, dot(w, n), n)
-            more = plus(more, 0.5 * dt if moves[A] or lasts else 0.5 * dt - h, cross(about, slide))
-        if kind[b] != SPHERE:
-            more = plus(more, 1.0, cross(w, plus(plus(below, 1.0, first_bow), -1.0, their)))
-        more = plus(more, -1.0, cross(u, plus(plus(inside, 1.0, first_arc), -1.0, own)))
-        if kind[a] >= CONVEX:
-            more = plus(more, -0.5, cross(u, plus(arc, -1.0, first_arc)))
-        if kind[b] >= CONVEX:
-            more = plus(more, 0.5, cross(w, plus(bow, -1.0, first_bow)))
-        more = plus(more, -dot(more, n), n)
-        own, their = plus(own, half, n), plus(their, -half, n)
+        arm, other = plus(arm, half, n), plus(other, -half, n)
         if not here:
             gap[c], deep[found] = linear[c], c
-            found += linear[c] < -DEEP * _thickness(kind[a], size[a], inner)
-        first, second = (their, own) if swap else (own, their)
-        at, to = (place[B], place[A]) if swap else (place[A], place[B])
+            found += linear[c] < -DEEP * _thickness(guest.kind, size[a], inner)
+        at, to, of_i, of_j = (B, A, other, arm) if swap else (A, B, arm, other)
         for k in range(3):
             normal[c, k] = sign * n[k]
-            point[c, k] = at[k] + first[k]
-            moved[c, k] = point[c, k] - second[k] - to[k]
+            point[c, k] = place[at, k] + of_i[k]
+            moved[c, k] = point[c, k] - of_j[k] - place[to, k]
             swing[c, k] = sign * more[k]
     for c in range(len(pair)):
         wide += gap[c] > reach[pair[c]]
     return moved, swing, linear, deep[:found], wide
+
+
+class Side(NamedTuple):
+    """A shape of a pair, guest or host, in a compiled loop, and how its body goes on."""
+
+    kind: int
+    radius: float  #: of a sphere or capsule, whose surface turns with the normal and not with the body; else 0 [m]
+    center: Vector  #: from the place of the body to that of the shape, at the start [m]
+    velocity: Vector  #: of the body [m/s]
+    spin: Vector  #: [rad/s]
+    moves: bool  #: by impulses
+
+
+class Arms(NamedTuple):
+    """Ways from the place of a body of a contact [m]."""
+
+    core: Vector  #: at the start, to what turns with the body: the axis of a capsule, a point of a flat face
+    arm: Vector  #: to where impulses act
+    arc: Vector  #: from the core on to the surface, at the end
+    first: Vector  #: the same at the start
+
+
+@inlined
+def _side(s, forms, poses, course):
+    (kind, row, size, _), (center, _), (place, velocity, moves, _) = forms, poses, course
+    S = row[s]
+    radius = size[s, 0] if kind[s] in (SPHERE, CAPSULE) else 0.0
+    lever = plus(center[s], -1.0, place[S])
+    return Side(kind[s], radius, lever, vector_of(velocity[S], 0), vector_of(velocity[S], 3), moves[S])
+
+
+@inlined
+def _turned_to_end(guest, host, between, h, quaternion, size):
+    """Of a sphere that was found where the bodies are, `between` from its host: normal, gap and arms of the end."""
+    ahead, beside = after_turn(guest.center, guest.spin, h), after_turn(host.center, host.spin, h)
+    way = plus(plus(plus(between, h, guest.velocity), -h, host.velocity), -1.0, beside)
+    way = plus(plus(way, 1.0, plus(ahead, -1.0, guest.center)), 1.0, host.center)
+    n, gap = _from_host(way, host.kind, quaternion, size, guest.radius, host.spin, h)
+    other = plus(plus(host.center if host.kind == SPHERE else beside, 1.0, way), guest.radius + gap, n)
+    return n, gap, plus(guest.center, guest.radius, n), other
+
+
+@inlined
+def _found_at_end(guest, host, apart, h, normal, spot, gap):
+    """The same of a guest that was found where `seen_from` puts it, at a `spot` of its host: they turn with this."""
+    n, middle = after_turn(normal, host.spin, h), after_turn(spot, host.spin, h)
+    arm = plus(plus(middle, -0.5 * gap, n), -1.0, apart)
+    return n, gap, plus(arm, h, plus(host.velocity, -1.0, guest.velocity)), plus(middle, 0.5 * gap, n)
+
+
+@inlined
+def _arcs(side, out, end, start, arcs, c, column):
+    """From what turns with a body to its surface, where the normal that goes `out` of it is that of the end, or of the
+    start."""
+    if side.kind >= CONVEX:
+        return vector_of(arcs[c, column], 0), vector_of(arcs[c, column + 1], 0)
+    r = out * side.radius
+    return (r * end[0], r * end[1], r * end[2]), (r * start[0], r * start[1], r * start[2])
+
+
+@inlined
+def _velocity_at(side, arm):
+    return plus(side.velocity, 1.0, cross(side.spin, arm))
+
+
+@inlined
+def _swing(one, two, normal, early, h, dt):
+    """By how much the mean velocities of surfaces along each other, of host relative to guest, differ from those with
+    their arms; `early`: those of the guest are of the start. Each of them is a `Side` with its `Arms`."""
+    (guest, own), (host, their) = one, two
+    u, w = guest.spin, host.spin
+    more = plus(_bend(their.core, w, dt), -1.0, _bend(own.core, u, dt))
+    if dot(their.arc, their.arc) == 0.0 and dot(w, normal) != 0.0:  # the contact goes along a face that spins
+        about = plus(_ZERO, dot(w, normal), normal)
+        more = plus(more, 0.5 * dt if early else 0.5 * dt - h, cross(about, _slide(one, two, h, dt)))
+    if host.kind != SPHERE:
+        more = plus(more, 1.0, cross(w, plus(plus(their.core, 1.0, their.first), -1.0, their.arm)))
+    more = plus(more, -1.0, cross(u, plus(plus(own.core, 1.0, own.first), -1.0, own.arm)))
+    if guest.kind >= CONVEX:
+        more = plus(more, -0.5, cross(u, plus(own.arc, -1.0, own.first)))
+    if host.kind >= CONVEX:
+        more = plus(more, 0.5, cross(w, plus(their.arc, -1.0, their.first)))
+    return plus(more, -dot(more, normal), normal)
+
+
+@inlined
+def _slide(one, two, h, dt):
+    """The velocity of the contact on the host, as in the middle of the last step, whose velocities bodies have."""
+    (guest, own), (host, their) = one, two
+    speed = plus(_before(guest, dt), 1.0, cross(guest.spin, after_turn(own.core, guest.spin, -0.5 * dt)))
+    speed = plus(speed, 1.0 / h, plus(own.arc, -1.0, own.first))
+    speed = plus(speed, -1.0, _before(host, dt))
+    return plus(speed, -1.0, cross(host.spin, after_turn(their.core, host.spin, -0.5 * dt)))
+
+
+@inlined
+def _before(side, dt):
+    """The velocity of a body in the last step: of one of prescribed motion as it turns with its spin."""
+    return side.velocity if side.moves else after_turn(side.velocity, side.spin, -dt)
 
 
 @inlined
@@ -233,12 +305,6 @@ def of_start(lasting, c, sign):
     if not len(lasting):
         return 0.0, 0.0, 0.0
     return sign * lasting[c, 0], sign * lasting[c, 1], sign * lasting[c, 2]
-
-
-@inlined
-def _before(velocity, spin, moves, dt):
-    """The velocity of a body in the last step: of one of prescribed motion as it turns with its spin."""
-    return velocity if moves else after_turn(velocity, spin, -dt)
 
 
 @loop
