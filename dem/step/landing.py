@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from dem.contact_map import ContactMap
 
 MOST = 2.0  #: normal impulses of a body over those of the forces on it, above which it was struck in the last step
-SLOW = 0.5  #: of the speed that forces give in a step, at which contacts close that take over a load as bodies roll
 LEFT = 0.01  #: of what a contact bears before, which it bears beside that where it opens
 
 
@@ -68,7 +67,6 @@ def landing(
     whole = np.where(bears[:, None], last, 0.0)
     speed = -dt * (freely[:, 0] + contact_map.velocities(contact_map.momenta(whole))[:, 0])
     lands = (body >= 0) & (last[:, 0] == 0.0) & (gap > 0.0) & (speed > gap)
-    lands &= speed > SLOW * dt * push[body]
     time = np.full(len(table.mass), np.inf)
     np.minimum.at(time, body[lands], gap[lands] / speed[lands])
     part = np.where(time < 1.0, 0.5 + time, 0.0)[body][:, None]
