@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from dem.arrays import Floats, Keys, places
+from dem.arrays import Bools, Floats, Keys, places
 from dem.bodies import Bodies
 from dem.compiled import inlined, loop
 from dem.contact_map import CompactRows, ContactMap, Halo
@@ -38,7 +38,7 @@ from dem.step.resistance import resistance
 from dem.step.servo import cell_of
 from dem.step.surface import surface_velocities
 from dem.unconstrained import UnconstrainedMotion, free_velocities, large_velocity
-from dem.unconstrained.constraints import coupling_of, coupling_refound, slots
+from dem.unconstrained.constraints import Coupling, coupling_of, coupling_refound, slots
 from dem.unconstrained.drives import Drives, free_directions
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class ContactSystem:
         middle (owned, 3): the angular velocities about which those of the step are linear in the impulses, see
         `dem.free_motion.free_spin`, or None
         resistance: the rows of `dem.step.resistance`, or None
-        met: the contacts, as the laws of contact see them; None where none adds anything
+        contact_state: the contacts, as the laws of contact see them; None where none adds anything
         past (nc, columns): what the laws of contact kept of them in the last step
         attraction (nc,): attractive impulses along the normals [N s], or None; see `dem.parts.laws`
         landing: what contacts bear until bodies land, a `dem.step.landing.Landing`, or None
@@ -100,71 +100,67 @@ class ContactSystem:
         and with which springs begin. `eased`: contacts that bounce with a part of e alone, by key, from the method of
         that name; `smooth`: impacts without friction; `kept` (nc, columns): what the laws of contact kept of these
         contacts."""
-        dt, near, owned = motion.dt, contacts.near, world.owned
         if np.isnan(recovery_speed) or recovery_speed < 0.0:
             raise ValueError(f"recovery speed must not be negative, got {recovery_speed}")
-        self.dt, self.contacts, self.near, self.drives, self.applied = dt, contacts, near, motion.drives, motion.applied
-        self.key, self.point = contacts.key, contacts.point
-        self.frame = contacts.frame
+        self.dt, self.contacts, self.near = motion.dt, contacts, contacts.near
+        self.drives, self.applied = motion.drives, motion.applied
+        self.key, self.point, self.frame = contacts.key, contacts.point, contacts.frame
+        last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
+        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
         self.contact_map = _map_of(world, contacts, self.frame, self.drives)
         self.surface = surface_velocities(world, contacts, self.frame)
         self.take_flow(world, contacts)
-        self.past = np.zeros((len(contacts), world.pairs.columns)) if kept is None else kept
-        state = contact_state(world, contacts, dt, self._slip(contacts)) if world.pairs.acting else None
-        self.contact_state = state
-        pull = None if state is None else world.pairs.attraction(state, self.past)
-        self.attraction = None if pull is None else dt * pull
-        self.mu = contacts.friction if state is None else world.pairs.cone(state, self.past, contacts.friction)
-        self.friction = self.mu
-        last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
+        self._meet_laws(world, kept)
         self.motion, change = self._linearised(world, motion, last)
-        self.coupling = self.motion.coupling
         free, freely, rounding = self._free(world, change)
-        self.free_velocity = free[:owned]
-        self.free_large = free[near.grains + near.ghosts :]
-        b = np.zeros((len(contacts), 3))
-        self.stiffness, self.compliance, b[:, 0] = gap_velocities(world, contacts, dt, recovery_speed)
-        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
-        if self.surface is not None:
-            b[:, 1:] = self.surface
-        self.cell = cell_of(world, dt)
-        if self.cell is not None:
-            mass = CellMass(world.comm, self.contact_map.source.root, self.cell)
-            self.contact_map = self.contact_map.with_mass(mass)
-            way = contacts.branch(near.bodies.position)
-            freely += np.einsum("cij,cj->ci", self.frame, self.cell.free * way)
-        if contacts.drift is not None:
-            freely += np.einsum("cij,cj->ci", self.frame, contacts.drift)
-        self._given: Floats | float = 0.0  #: mass-scaled momenta of what is no part of the cone problem
-        self.later: Floats | None = None
-        self.landing = landing(world, contacts, self.contact_map, free, freely, last, dt)
-        known = self.attraction is not None or self.landing is not None
-        if known:
-            self._given = momentum = self.contact_map.momenta(self.net(np.zeros_like(last)))
-            self.free_velocity = self.velocity_with(momentum)
-            freely += self.contact_map.velocities(momentum)
-        if self.landing is not None:
-            b += self.landing.before * self.compliance[:, [0, 1, 1]]
-        self.resistance = resistance(world, contacts, state, self.contact_map, self.frame, free)
+        b = self._gap_velocities(world, recovery_speed)
+        self.resistance = resistance(world, contacts, self.contact_state, self.contact_map, self.frame, free)
         self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
-        if self.resistance is not None and known:
-            self.resistance.velocity[:] += self.problem_map.velocities(momentum)[len(contacts) :]
-        self.at_once = 0
-        self._bounces = np.zeros(len(contacts), np.bool_)
-        if world.pairs.bounces:
-            self._freely = freely
-            self._bounce(world, contacts, freely[:, 0], eased, b)
-        impacts = self._bounces
-        if contacts.parting is not None:
-            strikes = np.isfinite(contacts.parting)
-            b[strikes, 0], self.compliance[strikes] = -contacts.parting[strikes], 0.0
-            impacts = impacts | strikes
+        self.landing = landing(world, contacts, self.contact_map, free, freely, last, self.dt)
+        self._bear(freely, b)
+        impacts = self._impacts(world, freely, eased, b)
         if smooth:
             self.mu = np.where(impacts, 0.0, self.mu)
         swing = np.zeros((0, 3)) if contacts.swing is None else contacts.swing
         self.r = _beyond(b, freely, rounding, self.frame, swing, impacts, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
+
+    def _meet_laws(self, world: World, kept: Floats | None) -> None:
+        """Find what the laws of contact make of the contacts: attraction, and the friction of the cones."""
+        contacts, pairs = self.contacts, world.pairs
+        self.past = np.zeros((len(contacts), pairs.columns)) if kept is None else kept
+        self.contact_state, self.attraction, self.friction = None, None, contacts.friction
+        if pairs.acting:
+            self.contact_state = state = contact_state(world, contacts, self.dt, self._slip(contacts))
+            pull = pairs.attraction(state, self.past)
+            self.attraction = None if pull is None else self.dt * pull
+            self.friction = pairs.cone(state, self.past, contacts.friction)
+        self.mu: Floats = self.friction
+
+    def _gap_velocities(self, world: World, recovery_speed: float) -> Floats:
+        """b (nc, 3), and the stiffness and compliance of the contacts."""
+        b = np.zeros((len(self.contacts), 3))
+        self.stiffness, self.compliance, b[:, 0] = gap_velocities(world, self.contacts, self.dt, recovery_speed)
+        if self.surface is not None:
+            b[:, 1:] = self.surface
+        return b
+
+    def _bear(self, freely: Floats, b: Floats) -> None:
+        """Add what contacts do beside the cone problem, by attraction and until bodies land, to the velocities without
+        impulses of bodies, of contacts, `freely` (nc, 3), and of turning, and to b (nc, 3); collective."""
+        self._given: Floats | float = 0.0  #: mass-scaled momenta of what is no part of the cone problem
+        self.later: Floats | None = None
+        if self.attraction is None and self.landing is None:
+            return
+        self._given = self.contact_map.momenta(self.net(np.zeros_like(freely)))
+        self.free_velocity = self.velocity_with(self._given)
+        change = self.problem_map.velocities(self._given)
+        freely += change[: len(freely)]
+        if self.resistance is not None:
+            self.resistance.velocity[:] += change[len(freely) :]
+        if self.landing is not None:
+            b += self.landing.before * self.compliance[:, [0, 1, 1]]
 
     def _linearised(
         self, world: World, motion: UnconstrainedMotion, last: Floats
@@ -186,9 +182,9 @@ class ContactSystem:
         return replace(motion, push=push, coupling=coupling), change
 
     def _free(self, world: World, change: Floats | None) -> tuple[Floats, Floats, Floats]:
-        """Velocities (rows, 6) without contacts of the bodies of `near`, with constraints, of contacts (nc, 3), and
-        their rounding (nc,); collective. Sets `middle` and the inverse mass of constrained bodies."""
-        given, row, owned = self.contact_map.source, self.contact_map.body, world.owned
+        """Velocities (rows, 6) without contacts of the bodies of `near`, with constraints, of contacts (nc, 3), with
+        the cell, and their rounding (nc,); collective. Sets `middle`, and the inverse mass of the map."""
+        given, row = self.contact_map.source, self.contact_map.body
         free, self.middle = free_velocities(world, self.near, self.motion, change)
         if self.applied is not None or change is not None:
             self.contact_map.halo.update(free)
@@ -196,30 +192,55 @@ class ContactSystem:
             moves = np.isfinite(self.near.bodies.mass)[:, None]
             self._forced = np.where(moves, free[:, :3] - self.near.bodies.velocity[:, :3], 0.0)  # not by constraints
         freely, rounding = closing(given.frame, given.arm, row, free)
+        self.coupling = self.motion.coupling
         if self.coupling is not None:
-            here, slot = slots(world, self.near.bodies.id)
-            spin = self.coupling.spin[slot]
-            free[here, 3:] = np.where(np.isnan(spin), free[here, 3:], spin)
-            free[here] += self.coupling.change[slot]
-            if self.middle is not None:
-                self.middle[here[here < owned]] = self.coupling.middle[slot[here < owned]]
+            self._constrain(world, self.coupling, free)
             freely, more = closing(given.frame, given.arm, row, free)
             rounding += more
-            own = here < owned
-            mass = ConstrainedMass(world.comm, given.root, here[own], slot[own], self.coupling.matrix)
-            self.contact_map = self.contact_map.with_mass(mass)
+        self.free_velocity, self.free_large = free[: world.owned], free[self.near.grains + self.near.ghosts :]
+        self.cell = cell_of(world, self.dt)
+        if self.cell is not None:
+            self.contact_map = self.contact_map.with_mass(CellMass(world.comm, given.root, self.cell))
+            way = self.contacts.branch(self.near.bodies.position)
+            freely += np.einsum("cij,cj->ci", self.frame, self.cell.free * way)
+        if self.contacts.drift is not None:
+            freely += np.einsum("cij,cj->ci", self.frame, self.contacts.drift)
         return free, freely, rounding
 
-    def _bounce(
-        self, world: World, contacts: Contacts, freely: Floats, eased: tuple[Keys, Floats] | None, r: Floats
-    ) -> None:
+    def _constrain(self, world: World, coupling: Coupling, free: Floats) -> None:
+        """Let constraints change the free velocities (rows, 6), and the inverse mass."""
+        owned = world.owned
+        here, slot = slots(world, self.near.bodies.id)
+        spin = coupling.spin[slot]
+        free[here, 3:] = np.where(np.isnan(spin), free[here, 3:], spin)
+        free[here] += coupling.change[slot]
+        own = here < owned
+        if self.middle is not None:
+            self.middle[here[own]] = coupling.middle[slot[own]]
+        mass = ConstrainedMass(world.comm, self.contact_map.source.root, here[own], slot[own], coupling.matrix)
+        self.contact_map = self.contact_map.with_mass(mass)
+
+    def _impacts(self, world: World, freely: Floats, eased: tuple[Keys, Floats] | None, b: Floats) -> Bools:
+        """Which contacts (nc,) are impacts: they bounce, or `dem.step.impacts` gives them the speed with which they
+        part. By b (nc, 3) they part so."""
+        self.at_once, self._bounces, self._freely = 0, np.zeros(len(b), np.bool_), freely
+        if world.pairs.bounces:
+            self._bounce(world, freely[:, 0], eased, b)
+        parting = self.contacts.parting
+        if parting is None:
+            return self._bounces
+        strikes: Bools = np.isfinite(parting)
+        b[strikes, 0], self.compliance[strikes] = -parting[strikes], 0.0
+        return self._bounces | strikes
+
+    def _bounce(self, world: World, freely: Floats, eased: tuple[Keys, Floats] | None, b: Floats) -> None:
         """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton), by
-        the normal numbers of r (nc, 3).
+        the normal numbers of b (nc, 3).
 
         They begin if without impulses they close in the step, `freely` (nc,) [m/s], and come faster than `slowest`: a
         body at rest does not bounce."""
-        table, a, b = contacts.near.bodies, contacts.a, contacts.b
-        e = world.pairs.restitution[table.material[a], table.material[b]]
+        contacts, table = self.contacts, self.near.bodies
+        e = world.pairs.restitution[table.material[contacts.a], table.material[contacts.b]]
         came = self.contact_map.relative_velocities(table.velocity)[:, 0]
         if self.drift is not None:
             came = came + self.drift[:, 0]
@@ -233,7 +254,7 @@ class ContactSystem:
             place = places(eased[0], self.key)
             self._part[place >= 0] = eased[1][place[place >= 0]]
             e = e * self._part
-        r[begin, 0] = np.minimum(r[begin, 0], (e * came)[begin])
+        b[begin, 0] = np.minimum(b[begin, 0], (e * came)[begin])
         self.compliance[begin] = 0.0
 
     def eased(self, world: World, impulse: Floats, momentum: Floats) -> tuple[Keys, Floats] | None:
