@@ -119,8 +119,7 @@ class ContactSystem:
         self.landing = landing(world, contacts, self.contact_map, free, freely, last, self.dt)
         self._bear(freely, b)
         impacts = self._impacts(world, freely, eased, b)
-        if smooth:
-            self.mu = np.where(impacts, 0.0, self.mu)
+        self.mu = np.where(impacts, 0.0, self.friction) if smooth else self.friction
         swing = np.zeros((0, 3)) if contacts.swing is None else contacts.swing
         self.r = _beyond(b, freely, rounding, self.frame, swing, impacts, self.compliance, self.held)
         if self.resistance is not None:
@@ -136,7 +135,6 @@ class ContactSystem:
             pull = pairs.attraction(state, self.past)
             self.attraction = None if pull is None else self.dt * pull
             self.friction = pairs.cone(state, self.past, contacts.friction)
-        self.mu: Floats = self.friction
 
     def _gap_velocities(self, world: World, recovery_speed: float) -> Floats:
         """b (nc, 3), and the stiffness and compliance of the contacts."""
