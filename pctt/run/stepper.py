@@ -19,10 +19,11 @@ from dem.model.images import wrap
 from dem.model.partition import rebalance
 from dem.model.world import World
 from dem.record.passage import insert_and_remove
-from dem.step import Step, advance, carried, find_overrun, find_turned
+from dem.step import Step, advance
 from dem.step.fast import refuse_passages
 from dem.step.impacts import in_order
 from dem.step.impulses import ImpulseMemory
+from dem.step.missed import carried, find_overrun, find_turned
 from dem.step.system import ContactSystem
 from dem.together import SceneError
 from dem.unconstrained import UnconstrainedMotion, unconstrained

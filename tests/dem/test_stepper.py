@@ -12,7 +12,8 @@ from dem.motion import Glide
 from dem.scene import Scene
 from dem.shapes import Box
 from dem.start import new_world
-from dem.step import advance, carried
+from dem.step import advance
+from dem.step.missed import carried
 from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
 

@@ -10,13 +10,14 @@ from drive import RADIUS, spinning
 from mpi4py import MPI
 from several_ranks import alone
 
-from dem import quaternion, step
+from dem import quaternion
 from dem.contact import find_contacts
 from dem.record.energies import energy
 from dem.scene import Scene
 from dem.shapes import Plane
 from dem.start import new_world
-from dem.step import advanced, find_turned
+from dem.step import advanced, missed
+from dem.step.missed import find_turned
 from dem.unconstrained import unconstrained
 from pctt.simulation import Simulation
 
@@ -185,7 +186,7 @@ def test_only_contacts_of_bodies_that_turn_are_looked_for_again(monkeypatch):
     spin[5] = 0, 0, 4.0
     scene.add_boxes(low, (0.1, 0.1, 0.1), 1e3)
     scene.add_boxes(high, (0.1, 0.1, 0.1), 1e3, angular_velocity=spin)
-    search, bodies = step.find_contacts, []
+    search, bodies = missed.find_contacts, []
 
     def watched(*given, **named):
         found = search(*given, **named)
@@ -194,6 +195,6 @@ def test_only_contacts_of_bodies_that_turn_are_looked_for_again(monkeypatch):
             bodies.extend(found.near.bodies.id[found.b])
         return found
 
-    monkeypatch.setattr(step, "find_contacts", watched)
+    monkeypatch.setattr(missed, "find_contacts", watched)
     Simulation(scene, dt=0.005, comm=MPI.COMM_SELF).run(steps=4)
     assert set(bodies) == {5, 16 + 5}
