@@ -156,17 +156,13 @@ class Differences:
             values = np.moveaxis((1 - part) * here + part * opposite, 0, axis)
         return values
 
-    @property
-    def aperiodic(self) -> list[float]:
-        """For each axis, how far a(s) is from a(s - n), relative to the largest a(s), s not 0. If all are zero, A is a
-        circulant."""
+    def is_circulant(self) -> bool:
+        """Whether a(s) is a(s - n) along each axis, to rounding of the largest a(s), s not 0."""
         sizes = np.abs(self.values)
         sizes[(0,) * len(self.shape)] = 0.0
-        largest, found = sizes.max() or 1.0, []
-        for axis in range(len(self.shape)):
-            here, opposite, _ = self._along(axis, self.values)
-            found.append(float(np.abs(here - opposite)[1:].max(initial=0.0) / largest))
-        return found
+        rounding = 1e-12 * (sizes.max() or 1.0)
+        pairs = (self._along(axis, self.values) for axis in range(len(self.shape)))
+        return all(np.abs(here - opposite)[1:].max(initial=0.0) <= rounding for here, opposite, _ in pairs)
 
     def distance(self, transform: str) -> float:
         """Of A from the nearest matrix that a "cosine", a "sine" or a "circulant" diagonalises, over the size of A, in
@@ -421,7 +417,7 @@ def choose(a: Differences) -> Choice | None:
     all parts wins, so the harder parts count more; that of none grows as is foreseen. If a grid is too small for
     trials, the most promising one is taken.
     """
-    if max(a.aperiodic) <= 1e-12:  # which a part of the grid does not show
+    if a.is_circulant():  # which a part of the grid does not show
         exact = FastInverse(a, CIRCULANT)
         return Choice(CIRCULANT, CostEstimate(exact.each, [1.0, 0.0], [1.0, 0.0])) if exact.positive else None
     kinds, size, trials, scores = candidates(a), prod(a.shape), list[_Trial](), dict[Kind, float]()

@@ -33,11 +33,6 @@ class Work:
         if self.spent > self.limit:
             raise TooMuchWorkError(phase)
 
-    def foresee(self, operations: float, phase: str) -> None:
-        """Raise TooMuchWorkError already now if so many more operations would reach the limit."""
-        if self.spent + operations > self.limit:
-            raise TooMuchWorkError(phase)
-
 
 def apply_operations(train: Train) -> float:
     """Of a product with a vector."""
