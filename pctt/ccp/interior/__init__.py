@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pctt.arrays import TINY, Array
 from pctt.ccp.cones.lorentz import HELD
+from pctt.ccp.result import Limits, Status
 
 if TYPE_CHECKING:
     from pctt.ccp.problem import ConeProblem
@@ -30,6 +31,23 @@ def velocity(problem: ConeProblem, g: Array) -> Array:
     y = problem.product(g) + problem.r
     y[problem.mu == 0, 1:] = 0.0
     return y
+
+
+def end_of(
+    problem: ConeProblem, limits: Limits, history: list[float], dg: Array, dy: Array
+) -> tuple[Status, str] | None:
+    """Why Newton steps end that have left the residuals ``history``, the last of which has changed impulses and
+    velocities by dg and dy (nc, 3); None if they go on."""
+    if history[-1] <= limits.tol:
+        return Status.CONVERGED, limits.met
+    if len(history) > limits.max_it:
+        return Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
+    return (Status.BREAKDOWN, INDEFINITE) if is_indefinite(problem, dg, dy) else None
+
+
+def no_step(length: float, words: str) -> tuple[Status, str]:
+    """The end of a method that has found no step of a useful length."""
+    return (Status.STALLED, words) if length == length else (Status.BREAKDOWN, "not a number in the Newton step")
 
 
 def is_indefinite(problem: ConeProblem, dg: Array, dy: Array) -> bool:

@@ -36,10 +36,10 @@ import numpy as np
 
 from pctt.arrays import Array
 from pctt.ccp.cones.friction import step_to_zero
-from pctt.ccp.interior import INDEFINITE, hold, is_indefinite, velocity
+from pctt.ccp.interior import end_of, hold, no_step, velocity
 from pctt.ccp.newton.kkt import KKT
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import Limits, Result, Status
+from pctt.ccp.result import Limits, Result
 
 if TYPE_CHECKING:
     from pctt.ccp.newton import Newton
@@ -63,14 +63,7 @@ def solve(
         errors = problem.errors(g, y)
         history.append(limits.residual(errors))
         limits.report(iteration, history[-1])
-        if history[-1] <= limits.tol:
-            status, reason = Status.CONVERGED, limits.met
-            break
-        if iteration == limits.max_it:
-            status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
-            break
-        if is_indefinite(problem, g - last_g, y - last_y):
-            status, reason = Status.BREAKDOWN, INDEFINITE
+        if end := end_of(problem, limits, history, g - last_g, y - last_y):
             break
         last_g, last_y = g, y
         if step >= 0.5:
@@ -84,12 +77,11 @@ def solve(
         dg[free, 1:] = 0.0
         step = _line_search(problem, (g, lam, y), (dg, dlam), aim, boundary)
         if not step > 0:
-            status, reason = Status.STALLED, "the line search found no step that makes the residual smaller"
-            if step != step:
-                status, reason = Status.BREAKDOWN, "not a number in the Newton step"
+            end = no_step(step, "the line search found no step that makes the residual smaller")
             break
         g, lam = g + step * dg, lam + step * dlam
-    return Result(g, status, reason, history[-1], iteration, newton.linear.iterations, newton.linear.fallbacks, history)
+    assert end is not None
+    return Result(g, *end, history[-1], iteration, newton.linear.iterations, newton.linear.fallbacks, history)
 
 
 def constraints(g: Array, mu: Array) -> Array:

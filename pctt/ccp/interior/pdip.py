@@ -24,11 +24,11 @@ import numpy as np
 
 from pctt.arrays import Array, dot
 from pctt.ccp.cones.friction import step_to_zero, times
-from pctt.ccp.interior import INDEFINITE, hold, is_indefinite, paper, useful_part, velocity
+from pctt.ccp.interior import end_of, hold, no_step, paper, useful_part, velocity
 from pctt.ccp.newton import Newton
 from pctt.ccp.newton.kkt import KKT
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import Limits, Result, Status
+from pctt.ccp.result import Limits, Result
 from pctt.log import phase
 from pctt.options import FRACTION, number, option
 
@@ -123,14 +123,7 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
         errors = problem.errors(at.g, at.y)
         history.append(limits.residual(errors))
         limits.report(iteration, history[-1])
-        if history[-1] <= limits.tol:
-            status, reason = Status.CONVERGED, limits.met
-            break
-        if iteration == limits.max_it:
-            status, reason = Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
-            break
-        if is_indefinite(problem, at.g - last.g, at.y - last.y):
-            status, reason = Status.BREAKDOWN, INDEFINITE
+        if end := end_of(problem, limits, history, at.g - last.g, at.y - last.y):
             break
         # linearisation
         damping = _next_damping(damping, step, errors.natural, options)
@@ -145,14 +138,13 @@ def solve(problem: ConeProblem, guess: Array, limits: Limits, options: PDIP, new
             if longer > options.longer * step:
                 step, direction = longer, other
         if not step > options.least:
-            status, reason = Status.STALLED, "steps became too short"
-            if step != step:
-                status, reason = Status.BREAKDOWN, "not a number in the Newton step"
+            end = no_step(step, "steps became too short")
             break
         # update
         last, at = at, barrier.moved(at, direction, step)
     counts = newton.linear.iterations, newton.linear.fallbacks
-    return Result(at.g, status, reason, history[-1], iteration, *counts, history)
+    assert end is not None
+    return Result(at.g, *end, history[-1], iteration, *counts, history)
 
 
 class Point(NamedTuple):
