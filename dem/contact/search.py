@@ -94,8 +94,7 @@ class Contacts:
 
     def branch(self, position: Floats) -> Floats:
         """From the centre of body a to that of body b, or of its image (nc, 3), at these positions (rows, 3) [m]."""
-        branch = position[self.b] - position[self.a]
-        return branch if self.moved is None else branch + self.moved
+        return branches(self.a, self.b, position, np.zeros((0, 3)) if self.moved is None else self.moved)
 
     def flow(self, cell: Cell, position: Floats) -> Floats | None:
         """What the cell adds to the velocities of b relative to a (nc, 3) in a step from these positions (rows, 3), by
@@ -108,6 +107,18 @@ class Contacts:
     def take(self, rows: np.ndarray) -> Contacts:
         """The contacts of the given rows (index array or mask)."""
         return replace(self, **{name: column[rows] for name, column in self.columns().items()})
+
+
+@loop
+def branches(a: Ints, b: Ints, position: Floats, moved: Floats) -> Floats:
+    """The loop of `Contacts.branch`; `moved` (nc, 3) may have no row."""
+    out = np.empty((len(a), 3))
+    for c in range(len(a)):
+        for k in range(3):
+            out[c, k] = position[b[c], k] - position[a[c], k]
+            if len(moved):
+                out[c, k] += moved[c, k]
+    return out
 
 
 def contact_frames(normal: Floats) -> Floats:

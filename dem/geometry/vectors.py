@@ -35,5 +35,10 @@ def turned(v, r, sine, versed):
 def shares(r):
     """sin(a) / a and (1 - cos(a)) / a^2 of the angle a of a rotation vector."""
     square = dot(r, r)
-    angle = np.sqrt(square)
-    return (np.sin(angle) / angle, (1.0 - np.cos(angle)) / square) if angle > 1e-8 else (1.0, 0.5)
+    if square < 0.01:  # to rounding, and 1 - cos(a) keeps its figures
+        sine = 1.0 - square * (1 / 6 - square * (1 / 120 - square * (1 / 5040 - square * (1 / 362880))))
+        versed = 0.5 - square * (1 / 24 - square * (1 / 720 - square * (1 / 40320 - square * (1 / 3628800))))
+    else:
+        angle = np.sqrt(square)
+        sine, versed = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
+    return sine, versed

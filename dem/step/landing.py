@@ -24,6 +24,7 @@ from dem.shapes import Capsule, Convex, Sphere
 if TYPE_CHECKING:
     from dem.contact import Contacts
     from dem.contact_map import ContactMap
+    from dem.model.neighbourhood import Neighbourhood
 
 MOST = 2.0  #: normal impulses of a body over those of the forces on it, above which it was struck in the last step
 LEFT = 0.01  #: of what a contact bears before, which it bears beside that where it opens
@@ -56,14 +57,10 @@ def landing(
         return None
     table, gap = contacts.near.bodies, contacts.linear_gap
     push = np.linalg.norm(free[:, :3] - table.velocity[:, :3], axis=1)
-    body, bears = _bearing(contacts.a, contacts.b, (table.mass, push), gap, freely, last, dt)
+    corners = _with_corners(world, contacts.near)
+    body, bears = _bearing(contacts.a, contacts.b, (table.mass, push), corners, gap, freely, last, dt)
     if not on_any(contact_map.comm, bool(bears.any()))[0]:
         return None
-    smooth = (table.shape != BOX) & ((table.shape < POLYHEDRON) | (table.shape >= CONVEX))
-    first = contacts.near.grains + contacts.near.ghosts
-    round_parts = Sphere, Capsule, Convex
-    smooth[first:] = [any(isinstance(part, round_parts) for part in large.shapes) for large in world.large_bodies]
-    bears &= ~smooth[body]
     whole = np.where(bears[:, None], last, 0.0)
     speed = -dt * (freely[:, 0] + contact_map.velocities(contact_map.momenta(whole))[:, 0])
     lands = (body >= 0) & (last[:, 0] == 0.0) & (gap > 0.0) & (speed > gap)
@@ -73,13 +70,22 @@ def landing(
     return Landing(whole * np.minimum(part, 1.0), whole * np.maximum(part - 1.0, 0.0), lands)
 
 
+def _with_corners(world: World, near: Neighbourhood) -> Bools:
+    """Which bodies (rows,) are round nowhere."""
+    shape, first = near.bodies.shape, near.grains + near.ghosts
+    corners = (shape == BOX) | ((shape >= POLYHEDRON) & (shape < CONVEX))
+    round_parts = Sphere, Capsule, Convex
+    corners[first:] = [not any(isinstance(part, round_parts) for part in large.shapes) for large in world.large_bodies]
+    return corners
+
+
 @loop
 def _bearing(
-    a: Ints, b: Ints, laws: tuple[Floats, Floats], gap: Floats, freely: Floats, last: Floats, dt: float
+    a: Ints, b: Ints, laws: tuple[Floats, Floats], corners: Bools, gap: Floats, freely: Floats, last: Floats, dt: float
 ) -> tuple[Ints, Bools]:
-    """Of contacts (nc,) with a body that forces do not move, the row of the other, else -1; and which of them bore in
-    the last step, where another one of that body may close in this one. Bodies have masses, and forces add to their
-    speeds (rows,)."""
+    """Of contacts (nc,) of a body with `corners` (rows,) and one that forces do not move, the row of the former, else
+    -1; and which of them bore in the last step, where another one of that body may close in this one. Bodies have
+    masses, and forces add to their speeds (rows,)."""
     mass, push = laws
     body, bears = np.full(len(a), -1), np.zeros(len(a), np.bool_)
     lands, load = np.zeros(len(mass), np.bool_), np.zeros(len(mass))
@@ -88,6 +94,8 @@ def _bearing(
         if one == other:
             continue
         n = a[c] if one else b[c]
+        if not corners[n]:
+            continue
         body[c] = n
         load[n] += last[c, 0]
         lands[n] |= last[c, 0] == 0.0 and gap[c] > 0.0 and gap[c] + dt * freely[c, 0] < 0.0

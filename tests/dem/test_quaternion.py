@@ -6,6 +6,7 @@ from cases import random_quaternions
 from scipy.spatial.transform import Rotation
 
 from dem import quaternion
+from dem.geometry.vectors import shares
 
 RNG = np.random.default_rng(1)
 
@@ -43,3 +44,11 @@ def test_integration_turns_about_the_world_axis_by_the_right_angle():
         turned = quaternion.integrate(turned, np.array([[0.0, 0.0, 2.0]]), 0.01)
     expected = as_scipy(quaternion.exponential(np.array([[0.0, 0.0, 2.0]]))) * as_scipy(q)
     np.testing.assert_allclose(quaternion.matrix(turned), expected.as_matrix(), atol=1e-13)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-7, 1e-5, 0.01, 0.0999, 0.1001, 0.5, 3.0])
+def test_shares_of_a_turn_keep_their_figures(angle):
+    """1 - cos(a) alone would have lost half of them at 1e-5."""
+    sine, versed = shares((0.6 * angle, 0.0, 0.8 * angle))
+    half = np.sinc(0.5 * angle / np.pi)
+    np.testing.assert_allclose([sine, versed], [np.sinc(angle / np.pi), 0.5 * half**2], rtol=1e-13)

@@ -146,6 +146,21 @@ def test_turning_clumps_do_not_run_into_each_other():
             assert sim.contacts.gap.min(initial=0.0) > -0.02 * R
 
 
+def test_clumps_that_land_bear_nothing_before():
+    """They roll from sphere to sphere: a step does none of the work for bodies that go from edge to edge."""
+    scene = Scene(0.5)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    tilted = quaternion.exponential(np.array([[0.0, 0.2, 0.0]]))
+    scene.add_clumps((0, 0, 1.3 * R), DUMBBELL, 1000.0, quaternions=tilted)
+    struck = 0
+    with pctt.Simulation(scene, dt=DT) as sim:
+        for _ in range(40):
+            sim.step()
+            struck = max(struck, np.count_nonzero(sim.contacts.force[:, 2]))
+            assert sim.last.system.landing is None
+    assert struck == 2
+
+
 def test_clumps_in_a_periodic_cell():
     """One of two spheres across the boundary touches a grain on the other side."""
     scene = Scene(0.3, gravity=(0, 0, 0), period=(1.0, None, None))
