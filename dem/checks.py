@@ -27,6 +27,14 @@ def finite(name: str, values: ArrayLike) -> Floats:
     return array
 
 
+def points(name: str, values: ArrayLike) -> Floats:
+    """Return `values` (m) as a float array; ValueError unless all are finite, and their squares."""
+    array = finite(name, values)
+    if (most := float(np.abs(array).max(initial=0.0))) > 1e150:
+        raise ValueError(f"{name} must be from -1e150 to 1e150 m, as squares beyond overflow, got {most:g}")
+    return array
+
+
 def positive(name: str, values: ArrayLike) -> Floats:
     """Return `values` as a float array; ValueError unless all are finite and above zero."""
     array = finite(name, values)

@@ -732,7 +732,7 @@ class Scene:
         if not isinstance(positions, Rule):
             positions = np.atleast_2d(checks.finite("positions", positions))
         count, first = len(positions), self.count
-        columns = [Column.checked("positions", positions, count, 3)]
+        columns = [Column.checked("positions", positions, count, 3, check=checks.points)]
         row = (3,) if kind == BOX else ()
         for name, values in lengths.items():
             columns.append(Column.checked(name, values, count, *row, check=checks.positive))

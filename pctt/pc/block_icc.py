@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from pctt.blocks import shell_of
 from pctt.mat.order import Places, places_of
-from pctt.options import NOT_NEGATIVE, describe, option, read
+from pctt.options import describe, option, read
 from pctt.pc.incomplete_cholesky import BAD_BLOCK, BAD_PIVOT, MOST, Array, Blocks, Factor, compile_loops, factorised
 from pctt.pc.mat import is_symmetric
 from pctt.petsc import Context, block_values, given_options, on_coordinates, set_failed, warn
@@ -36,7 +36,7 @@ _TILT = np.array([1.0, 0.3, 0.1])  # of the sweep, by the extents of the points:
 
 def _is_shift(text: str) -> bool:
     try:
-        return text == "auto" or NOT_NEGATIVE[1](float(text))
+        return text == "auto" or 0.0 <= float(text) <= 1e6  # entries are about one, in single precision
     except ValueError:
         return False
 
@@ -51,7 +51,7 @@ class Options:
     )
     shift: str = option(
         "auto", "added to the diagonal of the scaled matrix; auto: half of tau, and twice as much whenever a pivot is "
-        "not positive", check=("auto or a number >= 0", _is_shift),
+        "not positive", check=("auto or a number from 0 to 1e6", _is_shift),
     )  # fmt: skip
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -147,18 +148,26 @@ def _refuse_without_effect(database: Mapping[str, str], run: Run, asked: Setting
                 raise OptionError(f"{f'-{name} {value or str()}'.rstrip()}: {reason}")
 
 
+#: Releases of PETSc differ in what numbers they refuse.
+TOLERANCES: dict[str, tuple[str, Callable[[float], bool]]] = {
+    "ksp_rtol": ("a number >= 0 and below 1", lambda x: 0.0 <= x < 1.0),
+    "ksp_atol": ("a finite number >= 0", lambda x: 0.0 <= x < math.inf),
+}
+
+
 def _refuse_for_petsc(database: Mapping[str, str], form: str, compare: ccp.Comparison) -> None:
     """OptionError for options of the KSPs that PETSc refuses or does not know. PETSc itself would complain only at the
     first Newton system, or never."""
     comm = compare.comm
     given = {n: spelt for n, spelt in solver_options(database).items() if n.startswith(("ksp_", "pc_"))}
-    spelt = given.get("ksp_rtol", "")
-    try:
-        rtol = float(database.get(spelt) or 0.0)
-    except ValueError:
-        rtol = 0.0  # PETSc says what is no number
-    if not 0.0 <= rtol < 1.0:  # releases of PETSc differ in what numbers they refuse
-        raise OptionError(f"-{spelt} {database[spelt]}: allowed is a number >= 0 and below 1")
+    for name, (allowed, holds) in TOLERANCES.items():
+        spelt = given.get(name, "")
+        try:
+            value = float(database.get(spelt) or 0.0)
+        except ValueError:
+            continue  # PETSc says what is no number
+        if not holds(value):
+            raise OptionError(f"-{spelt} {database[spelt]}: allowed is {allowed}")
     ksps = []
     later = INCOMPLETE if form == "contact" and "pc_type" not in given else {}
     try:
@@ -171,6 +180,7 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, compare: ccp.Compa
                     ksps[-1].setFromOptions()
             moved = set(origins.values())
             refuse_misspelt({n: spelt for n, spelt in given.items() if OWN + n not in moved})
+            given = {n: spelt for n, spelt in solver_options(database).items() if n.startswith("compare_")}
             compare.make_all()
     except OptionError:  # also from a preconditioner of ours
         raise

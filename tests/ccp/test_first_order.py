@@ -73,6 +73,23 @@ def test_the_scaled_problem_is_the_same_problem(given):
     assert uphill == pytest.approx(np.vdot(scaled.gradient(z), new.x - now.x))
 
 
+def test_the_curvature_of_a_tiny_step_is_no_rounding():
+    """N of rank 30 of 60 has no negative curvature, though images far from zero differ by their rounding along tiny
+    steps in its null space."""
+    rng = np.random.default_rng(0)
+    root, _ = np.linalg.qr(rng.normal(size=(60, 30)))
+    scaled = ScaledProblem(ccp.ConeProblem(SELF, rng.normal(size=(20, 3)), np.full(20, 0.5), N=root @ root.T))
+    weights = scaled.size.ravel()  # x = S g: A x = 0 where N g = 0
+    last = scaled.iterate(np.tile([1.0, 0.1, 0.1], (20, 1)))  # inside of all cones
+    for _ in range(20):
+        free = rng.normal(size=60)
+        tiny = 1e-13 * (weights * (free - root @ (root.T @ free))).reshape(-1, 3)
+        new = last.copy()
+        curvature, square, _ = scaled.step(last, last, 0.0, tiny, 1.0, new)
+        assert square > 0
+        assert curvature >= -1e-9 * square
+
+
 # -- faces --------------------------------------------------------------------------------------------------
 
 

@@ -39,6 +39,7 @@ def body(*arguments, **options):
     ("call", "message"),
     [
         (balls([[0, 0, np.nan]], 0.1, 1000.0), "positions: NaN or infinite"),
+        (balls([[0, -1e200, 0]], 0.1, 1000.0), "positions must be from -1e150 to 1e150 m"),
         (balls([[0, 0]], 0.1, 1000.0), r"positions must have shape \(3,\) or \(1, 3\)"),
         (balls([UP], [-0.1], 1000.0), "radius must be positive, got -0.1"),
         (balls([UP], [0.1, 0.2], 1000.0), r"radius must have shape \(\) or \(1,\), got \(2,\)"),

@@ -213,7 +213,8 @@ def test_a_matrix_that_is_not_symmetric_is_warned_of():
     ("options", "words"),
     [
         ({"tau": 2}, "-pc_bic_tau 2: allowed is a number >= 0 and below 1"),
-        ({"shift": -1}, "-pc_bic_shift -1: allowed is auto or a number >= 0"),
+        ({"shift": -1}, "-pc_bic_shift -1: allowed is auto or a number from 0 to 1e6"),
+        ({"shift": 1e300}, r"-pc_bic_shift 1e\+300: allowed is auto or a number from 0 to 1e6"),
         ({"taw": 1}, "-pc_bic_taw: no such option; did you mean -pc_bic_tau"),
     ],
 )

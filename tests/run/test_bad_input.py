@@ -48,6 +48,8 @@ BAD_OPTIONS = {
     "-ksp_rtol abc": ["abc"],
     "-ksp_rtol 1e3": ["1e3", "below 1"],  # a typing error for 1e-3
     "-ksp_rtol -1": ["-1", ">= 0"],
+    "-ksp_atol nan": ["-ksp_atol nan", ">= 0"],
+    "-compare_x_pc_factor_levels one -compare x:ilu": ["-compare_x_pc_factor_levels one: PETSc refuses"],
     "-pc_python_type nosuch.Thing -pc_type python": ["nosuch.Thing"],
     "-restart missing.h5": ["missing.h5", "no such file"],
     "-restart .": ["no such file"],

@@ -170,7 +170,11 @@ class ScaledProblem:
         work, square, uphill = cones.accelerated_step(now.x, last.x, y, soft, beta, length, self.coulomb, new.x)
         operator.find_image(new.x, new.image)
         work += operator.energy_of_step(new.image, now.image, last.image, beta)
-        return self.problem.sums(work, square, uphill)
+        work, square, uphill = self.problem.sums(work, square, uphill)
+        if work < 0.0:  # maps have none such; of a matrix images differ by their rounding, too, where steps are tiny
+            d = new.x - (now.x + beta * (now.x - last.x))
+            work = self.dots((d, self.product(d)))[0]
+        return work, square, uphill
 
     def project(self, x: Array) -> Array:
         """x moved to the nearest point of the cones, in place."""
