@@ -141,8 +141,8 @@ class SwingWatch:
         for name in sorted(before & set(swings)):
             self._told, w = True, swings[name]
             return (
-                f"dt {dt:g} s is too large: {name} swings with about {w:.2g} rad/s, by {dt * w:.2g} rad of its phase in "
-                f"a step; take at most {TURN / w:.2g} s"
+                f"dt {dt:g} s is too large: {name} swings with about {w:.2g} rad/s, by {dt * w:.2g} rad of its phase "
+                f"in a step; take at most {TURN / w:.2g} s"
             )
         return ""
 
