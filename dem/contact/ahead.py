@@ -30,6 +30,10 @@ along the normal at the place between two velocities, as in the method SHAKE (Ry
 Phys. 23, 1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge,
 without loss, also where bowl and edge move.
 
+Two spheres that impulses move have the normal of the end as seen from both, who roll on each other or turn as one:
+their mean spin is taken back. A pile that turns gains no angular momentum so; with the normal of the end it would gain
+w dt times the moment of all forces of contacts in a step.
+
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
 there then goes with the host (`seen_from`, `turn_ahead`).
@@ -164,6 +168,8 @@ def turn_ahead(
         given = not (moves[A] and moves[B])
         if here and given and gap[c] <= CLOSE * core:
             start = sign * normal[c, 0], sign * normal[c, 1], sign * normal[c, 2]
+        if here and kind[b] == SPHERE and not given:
+            start = after_turn(n, _rolling(u, core, w, under), -h)
         lasts = dot(start, start) > 0.0
         if not lasts:
             start = n
@@ -180,14 +186,14 @@ def turn_ahead(
             inside = after_turn(plus(own, -1.0, arc), u, -h)
         if h == 0.0 or dot(n, n) == 0.0:
             continue
-        lasts &= given or (flat and dot(arc, arc) > 0.0)
+        lasts &= given or (flat and dot(arc, arc) > 0.0) or (kind[a] == SPHERE and kind[b] == SPHERE)
         n = start if lasts else n
         below = plus(center[b], -1.0, place[B]) if kind[b] == SPHERE else after_turn(plus(their, -1.0, bow), w, -h)
         if moves[A] or lasts:
             own = plus(inside, 1.0, first_arc)
             if flat:
                 below = plus(own, 1.0, apart)  # the two arms lead to one place
-        if moves[B] and kind[b] != SPHERE:
+        if moves[B]:
             their = plus(below, 1.0, first_bow)
         linear[c] = after - h * dot(n, plus(plus(W, 1.0, cross(w, their)), -1.0, plus(V, 1.0, cross(u, own))))
         half = 0.5 * min(gap[c] if here else linear[c], 0.0)
@@ -233,6 +239,14 @@ def of_start(lasting, c, sign):
     if not len(lasting):
         return 0.0, 0.0, 0.0
     return sign * lasting[c, 0], sign * lasting[c, 1], sign * lasting[c, 2]
+
+
+@inlined
+def _rolling(spin, radius, other, beside):
+    """The angular velocity with which the line between two spheres turns where they roll on each other, or turn as one
+    body."""
+    share = radius / (radius + beside)
+    return plus((share * spin[0], share * spin[1], share * spin[2]), 1.0 - share, other)
 
 
 @inlined
