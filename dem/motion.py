@@ -371,42 +371,6 @@ def refuse_ignored(motion: Motion) -> None:
         raise ValueError(f"the motion {motion!r}: allowed is an object of dem.motion, or one with a method pose")
 
 
-def top_speed(motion: Motion, position: Floats, point: Floats, radius: Floats) -> float:
-    """The greatest speed [m/s] that a motion or a servo gives to what is within `radius` (n,) [m] of `point` (n, 3) [m]
-    at time zero, of a body which is then at `position` (3,); 0 of motions that are not of this module."""
-    still, along, about, center = np.zeros(3), np.zeros(3), np.zeros(3), position
-    if isinstance(motion, Rotation):
-        about, center = np.array(motion.velocity), np.array(motion.center)
-    elif isinstance(motion, Oscillation):
-        along = 2.0 * np.pi * motion.amplitude / motion.period * np.array(motion.direction)
-    elif isinstance(motion, Glide):
-        along = np.array(motion.velocity)
-    elif isinstance(motion, Path):
-        speeds = np.diff(np.array(motion.positions), axis=0) / np.diff(motion.times)[:, None]
-        along = max(speeds, key=np.linalg.norm, default=still)
-    elif isinstance(motion, Held):
-        along, about = np.array([value or 0.0 for value in (*motion.velocity, *motion.angular_velocity)]).reshape(2, 3)
-    elif isinstance(motion, Hinged):
-        about = (motion.speed or 0.0) * motion.line
-    elif isinstance(motion, Guided):
-        along = (motion.speed or 0.0) * motion.line
-    return greatest_speed(np.concatenate([along, about]), center, point, radius)
-
-
-def greatest_speed(velocity: Floats, center: Floats, point: Floats, radius: Floats) -> float:
-    """The greatest speed [m/s] within `radius` (n,) of the points (n, 3) [m] of a body which moves and turns about
-    `center` (3,) with `velocity` (6,) for ever: points keep their distances from the axis, by which they go fast."""
-    around = np.linalg.norm(np.cross(velocity[3:], point - center), axis=1) + np.linalg.norm(velocity[3:]) * radius
-    return float(np.linalg.norm(velocity[:3]) + around.max())
-
-
-def swing(motion: Motion) -> float:
-    """The angular frequency [rad/s] with which a motion swings; 0 of those that do not."""
-    if not isinstance(motion, Oscillation) or motion.amplitude == 0.0:
-        return 0.0
-    return 2.0 * np.pi / motion.period
-
-
 def changed(motion: Motion, time: float, **values: Any) -> Motion:
     """The motion with other parameters from `time` [s] on. An oscillation of another period stays in its phase, unless
     a phase is given. ValueError for a parameter that the motion does not have, or a bad value."""

@@ -42,6 +42,7 @@ from dem.record.energies import energy
 from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.start import step_remark
 from dem.start.time_step import fall_remark, reason
+from dem.start.tools import SwingWatch
 from dem.start.turns import TurnWatch
 from dem.step import Step
 from dem.step.impulses import ImpulseMemory
@@ -134,7 +135,7 @@ class Simulation:
             warn(comm, large)
         if doubts := "" if restart else comm.bcast(scene.doubts()):
             warn(comm, doubts)
-        self._turns = TurnWatch()
+        self._watches = TurnWatch(), SwingWatch()
         self._tell_turns()
         self._begun = restart
         self.restart = "" if isinstance(restart, state.RunState) else str(restart)  #: the file from which it goes on
@@ -250,9 +251,10 @@ class Simulation:
             warn(self.comm, report.unsolved_words(self.figures))
 
     def _tell_turns(self) -> None:
-        """Warn of a body that turns too far in a step; collective."""
-        if words := self._turns.look(self.world, self.settings.dt):
-            warn(self.comm, words)
+        """Warn of a body that turns or swings too far in a step; collective."""
+        for watch in self._watches:
+            if words := watch.look(self.world, self.settings.dt):
+                warn(self.comm, words)
 
     def run(
         self,

@@ -30,6 +30,10 @@ along the normal at the place between two velocities, as in the method SHAKE (Ry
 Phys. 23, 1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge,
 without loss, also where bowl and edge move.
 
+Two spheres that impulses move have the normal of the end as seen from both, who roll on each other or turn as one:
+their mean spin is taken back. A pile that turns gains no angular momentum so; with the normal of the end it would gain
+w dt times the moment of all forces of contacts in a step.
+
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
 there then goes with the host (`seen_from`, `turn_ahead`).
@@ -159,12 +163,14 @@ def turn_ahead(
         given, start = not (guest.moves and host.moves), of_start(lasting, c, sign)
         if here and given and gap[c] <= CLOSE * guest.radius:
             start = as_found
+        if here and host.kind == SPHERE and not given:
+            start = after_turn(n, _rolling(guest, host), -h)
         lasts = dot(start, start) > 0.0
         start = start if lasts else n
         arc, first_arc = _arcs(guest, 1.0, n, start, arcs, c, 0)
         bow, first_bow = _arcs(host, -1.0, n, start, arcs, c, 2)
         flat = dot(bow, bow) == 0.0
-        lasts &= given or (flat and dot(arc, arc) > 0.0)
+        lasts &= given or (flat and dot(arc, arc) > 0.0) or (guest.kind == SPHERE and host.kind == SPHERE)
         n = start if lasts else n
 
         # The arms of the start; on flat faces both lead to one place.
@@ -174,7 +180,7 @@ def turn_ahead(
         if early:
             arm = plus(core, 1.0, first_arc)
             seat = plus(arm, 1.0, apart) if flat else seat
-        if host.moves and host.kind != SPHERE:
+        if host.moves:
             other = plus(seat, 1.0, first_bow)
         linear[c] = end - h * dot(n, plus(_velocity_at(host, other), -1.0, _velocity_at(guest, arm)))
         if early and flat:
@@ -291,6 +297,14 @@ def _slide(one, two, h, dt):
     speed = plus(speed, 1.0 / h, plus(own.arc, -1.0, own.first))
     speed = plus(speed, -1.0, _before(host, dt))
     return plus(speed, -1.0, cross(host.spin, after_turn(their.core, host.spin, -0.5 * dt)))
+
+
+@inlined
+def _rolling(guest, host):
+    """The angular velocity with which the line between two spheres turns where they roll on each other, or turn as one
+    body."""
+    share, u = guest.radius / (guest.radius + host.radius), guest.spin
+    return plus((share * u[0], share * u[1], share * u[2]), 1.0 - share, host.spin)
 
 
 @inlined

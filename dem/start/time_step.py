@@ -14,12 +14,12 @@ import numpy as np
 from dem import bodies, quaternion
 from dem.arrays import Floats
 from dem.contact.primitives import extents
-from dem.motion import greatest_speed, swing, top_speed
 from dem.parts.named import Pressing
 from dem.scene import LargeBody, Scene
 from dem.shapes import Plane, outline
 from dem.start.falls import fall
 from dem.start.pressing import pressing
+from dem.start.tools import greatest_speed, swing, top_speed
 from dem.start.toppling import toppling
 from dem.start.turns import TURN, held_beside, turning_of_grains, turning_of_large
 
@@ -106,7 +106,7 @@ def fastest(scene: Scene) -> float:
 def fastest_tool(scene: Scene, about: bool = False) -> float:
     """Return the greatest speed of a large body that stays with the grains [m/s]; of the balls about their places
     if `about`, by which the stiffness is chosen."""
-    return max((_top_speed(body, about) for body in scene.large_bodies if body.name not in scene.leaving), default=0.0)
+    return max((_top_speed(body, about, for_settling(scene)) for body in _staying(scene)), default=0.0)
 
 
 def fastest_grain(scene: Scene) -> float:
@@ -124,7 +124,11 @@ def fastest_turn(scene: Scene) -> float:
 
 def fastest_swing(scene: Scene) -> float:
     """Return the greatest angular frequency of a tool that stays with the grains [rad/s]."""
-    return max((swing(body.motion) for body in scene.large_bodies if body.name not in scene.leaving), default=0.0)
+    return max((swing(body, for_settling(scene)) for body in _staying(scene)), default=0.0)
+
+
+def _staying(scene: Scene) -> list[LargeBody]:
+    return [body for body in scene.large_bodies if body.name not in scene.leaving]
 
 
 def _fall(scene: Scene) -> float:
@@ -133,9 +137,9 @@ def _fall(scene: Scene) -> float:
     return float(np.sqrt(smallest(scene) / gravity)) if gravity > 0.0 else 0.1
 
 
-def _top_speed(body: LargeBody, about: bool) -> float:
+def _top_speed(body: LargeBody, about: bool, step: float) -> float:
     """The greatest speed of a point of a large body [m/s], or of the ball `about` its place; a plane has no end, and
-    counts by the body's centre."""
+    counts by the body's centre. `step` [s]: as of `dem.start.tools.top_speed`."""
     shapes = tuple(shape for shape in body.shapes if not isinstance(shape, Plane))
     parts = [(np.zeros((1, 3)), extents([shapes]) if shapes else np.zeros(1))]
     if shapes and not about:
@@ -143,7 +147,7 @@ def _top_speed(body: LargeBody, about: bool) -> float:
     point, radius = (np.concatenate(column) for column in zip(*parts))
     point = body.position + quaternion.rotate(body.quaternion, point)
     start = greatest_speed(body.velocity, body.position, point, radius)
-    return max(start, top_speed(body.motion, body.position, point, radius))
+    return max(start, top_speed(body, point, radius, step))
 
 
 def _rounded(seconds: float) -> float:

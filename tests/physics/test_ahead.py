@@ -91,6 +91,7 @@ def test_where_velocities_stay_the_end_is_met(grains, floor, cell, kinds):
     here, there = pairs.T
     touching = {tuple(pair) for pair in start.body[start.gap <= 1e-4 * RADIUS] if pair[1] >= len(world.grains)}
     ends = np.array([tuple(pair) not in touching for pair in contacts.body[here]])  # what touches a tool keeps normals
+    ends &= (grains != "clumps") | (contacts.b[here] >= len(world.grains))  # two spheres turn by what they slide
     np.testing.assert_allclose(contacts.normal[here[ends]], end.normal[there[ends]], atol=1e-12)
     np.testing.assert_allclose((contacts.linear + dt * opening)[here], end.gap[there], atol=1e-12)
     shape = np.minimum(contacts.near.bodies.shape, POLYHEDRON)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from drive import RADIUS, SOLVERS, G, make_steps, steps
@@ -9,7 +11,7 @@ from mpi4py import MPI
 
 import pctt
 from dem import quaternion
-from dem.motion import Oscillation, Rotation, mean_velocity
+from dem.motion import Oscillation, Path, Rotation, mean_velocity
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from dem.start import new_world
@@ -148,3 +150,70 @@ def test_what_does_not_swing_or_leaves_asks_for_no_smaller_step():
     leaves.leaving = {"plate"}
     for scene in (rests, leaves):
         assert not any("swing" in what for what in needs(scene))
+
+
+class Shaking:
+    """As `Oscillation`, of a user's own; to and fro along z, or about x if it `turns`."""
+
+    def __init__(self, amplitude, turning, turns=False):
+        self.amplitude, self.turning, self.turns = amplitude, turning, turns
+
+    def pose(self, time, position, orientation):
+        swing = self.amplitude * np.sin(self.turning * time)
+        if self.turns:
+            return position, quaternion.multiply(quaternion.exponential(np.array([swing, 0, 0])), orientation)
+        return position + np.array([0, 0, swing]), orientation
+
+
+def moved_by(motion):
+    scene = Scene(0.3)
+    scene.add_body("plate", [Box((0.1, 0.2, 0.01))], motion, position=(0, 0, -0.01))
+    scene.add_spheres([0, 0, 0.02], 0.02, 1000.0)
+    return scene
+
+
+def path(amplitude, turning, seconds=1.0):
+    times = np.arange(0, seconds, 0.05 * 2 * np.pi / turning)
+    return Path(times, [(0, 0, amplitude * np.sin(turning * time)) for time in times])
+
+
+@pytest.mark.parametrize("motion", [path(0.002, 300.0), Shaking(0.002, 300.0), Shaking(0.01, 300.0, turns=True)])
+def test_the_default_step_resolves_what_swings_by_whatever_motion(motion):
+    """Only `Oscillation` was known to swing."""
+    assert recommended(moved_by(motion)) == pytest.approx(0.2 / 300.0, rel=0.1)
+
+
+def test_what_starts_stops_and_rests_is_no_swing():
+    class Late:
+        def pose(self, time, position, orientation):
+            return position + np.array([0, 0, -0.1 * max(time - 1.0, 0.0)]), orientation
+
+    class Short:
+        def pose(self, time, position, orientation):
+            if time > 0.1:
+                raise ValueError("no data")
+            return position + np.array([-0.5 * time, 0, 0]), orientation
+
+    stops = Path([0.0, 0.5, 0.6, 1.0, 1.001, 2.0], [(x, 0, 0) for x in (0, 0, 0.1, 0.1, 0.1001, 0.1001)])
+    for motion in (Late(), Short(), stops, Shaking(0.0, 300.0)):
+        assert not any("swing" in what for what in needs(moved_by(motion)) if needs(moved_by(motion))[what] < 0.004)
+
+
+def test_a_motion_of_ones_own_is_as_fast_as_it_is():
+    class Turning:
+        def pose(self, time, position, orientation):
+            return position, quaternion.multiply(quaternion.exponential(np.array([0, 0, 20.0 * time])), orientation)
+
+    expected = recommended(moved_by(Rotation((0, 0, 20.0))))
+    assert recommended(moved_by(Turning())) == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize("change", [{"period": 0.02}, {"motion": path(0.002, 300.0, 3.0)}])
+def test_a_tool_that_a_run_lets_swing_too_fast_is_told(change):
+    with pctt.Simulation(moved_by(Oscillation((0, 0, 1), 0.0005, 0.2)), comm=MPI.COMM_SELF) as sim:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            sim.run(until=0.3)
+        sim.change("body plate", **change)
+        with pytest.warns(UserWarning, match="plate swings with about [23].* take at most 0.000"):
+            sim.run(until=0.6)

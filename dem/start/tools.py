@@ -1,0 +1,151 @@
+"""How fast tools of prescribed motion go, and how fast they swing: what a time step has to resolve.
+
+A swing is told by the mean velocities v of a body in intervals h, and by how much they change from one to the next:
+(2 sin(w h / 2))^2 = <|dv|^2> / <|v|^2> for a sine of the angular frequency w. Jumps of a velocity, such as starts and
+stops, are no swing: of each RUN changes after each other the median counts.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dem import quaternion
+from dem.arrays import Floats
+from dem.motion import KINDS, Glide, Guided, Held, Hinged, Oscillation, Path, Rotation, velocity_between
+from dem.start.turns import SLACK, TURN
+
+if TYPE_CHECKING:
+    from dem.model.world import World
+    from dem.scene import LargeBody
+
+SAMPLES = 1000  #: poses of a motion of one's own that are looked at, from time zero on
+FINE = 0.25  #: between them, in steps in which grains come to rest
+ROUNDED = 1e-10  #: of their places [m] and of a radian, that poses may be off without being moved
+RUN = 5  #: changes of velocity
+WINDOW = 20  #: steps of a run whose velocities are looked at together; a tool that swings in two of them is told
+
+
+def top_speed(body: LargeBody, point: Floats, radius: Floats, step: float) -> float:
+    """The greatest speed [m/s] that its motion or servo gives to what is within `radius` (n,) [m] of `point` (n, 3) [m]
+    at time zero, of a large body. Motions of one's own are looked at in every FINE part of a `step` [s]."""
+    motion, still, along, about, center = body.motion, np.zeros(3), np.zeros(3), np.zeros(3), body.position
+    if _is_own(body):
+        _, velocity = _sampled(body, step)
+        turning = np.linalg.norm(velocity[:, 3:], axis=1)
+        spin = velocity[turning.argmax(), 3:]  # about an axis that goes with the body
+        return float(np.linalg.norm(velocity[:, :3], axis=1).max()) + greatest_speed(
+            np.concatenate([still, spin]), center, point, radius
+        )
+    if isinstance(motion, Rotation):
+        about, center = np.array(motion.velocity), np.array(motion.center)
+    elif isinstance(motion, Oscillation):
+        along = 2.0 * np.pi * motion.amplitude / motion.period * np.array(motion.direction)
+    elif isinstance(motion, Glide):
+        along = np.array(motion.velocity)
+    elif isinstance(motion, Path):
+        speeds = np.diff(np.array(motion.positions), axis=0) / np.diff(motion.times)[:, None]
+        along = max(speeds, key=np.linalg.norm, default=still)
+    elif isinstance(motion, Held):
+        along, about = np.array([value or 0.0 for value in (*motion.velocity, *motion.angular_velocity)]).reshape(2, 3)
+    elif isinstance(motion, Hinged):
+        about = (motion.speed or 0.0) * motion.line
+    elif isinstance(motion, Guided):
+        along = (motion.speed or 0.0) * motion.line
+    return greatest_speed(np.concatenate([along, about]), center, point, radius)
+
+
+def greatest_speed(velocity: Floats, center: Floats, point: Floats, radius: Floats) -> float:
+    """The greatest speed [m/s] within `radius` (n,) of the points (n, 3) [m] of a body which moves and turns about
+    `center` (3,) with `velocity` (6,) for ever: points keep their distances from the axis, by which they go fast."""
+    around = np.linalg.norm(np.cross(velocity[3:], point - center), axis=1) + np.linalg.norm(velocity[3:]) * radius
+    return float(np.linalg.norm(velocity[:3]) + around.max())
+
+
+def swing(body: LargeBody, step: float) -> float:
+    """The angular frequency [rad/s] with which the motion of a large body swings; 0 of those that do not. Motions of
+    one's own are looked at in every FINE part of a `step` [s]."""
+    motion = body.motion
+    if isinstance(motion, Oscillation) and not _is_own(body):
+        return 2.0 * np.pi / motion.period if motion.amplitude else 0.0
+    if isinstance(motion, Path) and not _is_own(body):
+        lasts = np.diff(motion.times)
+        return float(_frequency(lasts, np.diff(np.array(motion.positions), axis=0) / lasts[:, None]))
+    if not _is_own(body):
+        return 0.0
+    lasts, velocity = _sampled(body, step)
+    return float(max(_frequency(lasts, velocity[:, :3]), _frequency(lasts, velocity[:, 3:])))
+
+
+def _is_own(body: LargeBody) -> bool:
+    """Whether the motion of a large body is prescribed, and not of a class of `dem.motion`."""
+    return hasattr(body.motion, "pose") and type(body.motion) not in KINDS.values()
+
+
+def _sampled(body: LargeBody, step: float) -> tuple[Floats, Floats]:
+    """Intervals (n,) [s] and the mean velocities (n, 6) in them, linear in the world and angular at time zero, of a
+    motion of one's own, up to a time for which it has no pose: a run tells of that when it comes there."""
+    lasts, poses = FINE * step, [body.pose(0.0)]
+    try:
+        poses += [body.pose(lasts * number) for number in range(1, SAMPLES)]
+    except Exception:  # noqa: BLE001 - of code that is not ours
+        poses = poses if len(poses) > 1 else poses * 2
+    velocity = np.array([velocity_between(*two, lasts) for two in zip(poses, poses[1:])])
+    least = ROUNDED / lasts * np.array([np.abs([place for place, _ in poses]).max(), 1.0])
+    velocity[np.abs(velocity) <= least.repeat(3)] = 0.0
+    turn = np.array([turn for _, turn in poses[1:]])
+    within = quaternion.rotate(quaternion.conjugate(turn), velocity[:, 3:])
+    velocity[:, 3:] = quaternion.rotate(poses[0][1], within)
+    return np.full(len(velocity), lasts), velocity
+
+
+def _frequency(lasts: Floats, velocity: Floats) -> Floats:
+    """The angular frequencies (...,) [rad/s] of swings with mean velocities (n, ..., 3) in intervals (n,) [s] after
+    each other; 0 where there are too few to tell."""
+    square = np.einsum("n...i,n...i->...", velocity, velocity)
+    if len(lasts) <= RUN:
+        return np.zeros(square.shape)
+    between = 0.5 * (lasts[1:] + lasts[:-1]).reshape(-1, *[1] * square.ndim)
+    rate = np.linalg.norm(np.diff(velocity, axis=0), axis=-1) / between
+    squares = np.median(np.lib.stride_tricks.sliding_window_view(rate**2, RUN, axis=0), axis=-1).sum(axis=0)
+    mean: Floats = np.sqrt(np.divide(squares, square, out=np.zeros(square.shape), where=square > 0.0))
+    half = 0.5 * float(lasts.mean())
+    return np.arcsin(np.minimum(half * mean, 1.0)) / half
+
+
+class SwingWatch:
+    """Tells once of a tool that swings too far in a step: by a `Path`, by a motion of one's own, or by one that a run
+    has changed."""
+
+    def __init__(self) -> None:
+        self._seen: list[Floats] = []
+        self._before: set[str] = set()
+        self._told = False
+
+    def look(self, world: World, dt: float) -> str:
+        """What to say of a dt [s] after a step, most often nothing; collective."""
+        if self._told:
+            return ""
+        self._seen.append(world.large.velocity)
+        if len(self._seen) < WINDOW:
+            return ""
+        seen, self._seen = self._seen, []
+        rows = [row for row, body in enumerate(world.large_bodies) if _may_swing(body)]
+        if not rows:
+            return ""
+        velocity = np.array(seen)[:, rows].reshape(WINDOW, -1, 2, 3)
+        found: Floats = world.comm.bcast(_frequency(np.full(WINDOW, dt), velocity).max(axis=1))
+        swings = {world.large_bodies[row].name: w for row, w in zip(rows, found.tolist()) if dt * w > SLACK * TURN}
+        before, self._before = self._before, set(swings)
+        for name in sorted(before & set(swings)):
+            self._told, w = True, swings[name]
+            return (
+                f"dt {dt:g} s is too large: {name} swings with about {w:.2g} rad/s, by {dt * w:.2g} rad of its phase "
+                f"in a step; take at most {TURN / w:.2g} s"
+            )
+        return ""
+
+
+def _may_swing(body: LargeBody) -> bool:
+    return isinstance(body.motion, (Oscillation, Path)) or _is_own(body)
