@@ -60,9 +60,8 @@ class Bodies(Tabular):
         """The bodies of the given rows (index array, mask or slice)."""
         if isinstance(rows, slice):
             return Bodies(**{name: column[rows] for name, column in self.columns().items()})
-        rows = np.asarray(rows)
-        rows = rows.nonzero()[0] if rows.dtype == bool else rows
-        return Bodies(**{name: column.take(rows, axis=0) for name, column in self.columns().items()})
+        index = np.flatnonzero(rows) if rows.dtype == bool else rows
+        return Bodies(**{name: column.take(index, axis=0) for name, column in self.columns().items()})
 
 
 def concatenate(parts: Sequence[Bodies]) -> Bodies:
