@@ -30,9 +30,9 @@ along the normal at the place between two velocities, as in the method SHAKE (Ry
 Phys. 23, 1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge,
 without loss, also where bowl and edge move.
 
-Two spheres that impulses move have the normal of the end as seen from both, who roll on each other or turn as one:
-their mean spin is taken back. A pile that turns gains no angular momentum so; with the normal of the end it would gain
-w dt times the moment of all forces of contacts in a step.
+Two spheres that impulses move have a normal between both: what they roll on each other, or turn as one, is taken back
+from that of the end. A pile that turns gains no angular momentum so; with the normal of the end it would gain w dt times
+the moment of all forces of contacts in a step.
 
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
@@ -164,7 +164,7 @@ def turn_ahead(
         if here and given and gap[c] <= CLOSE * guest.radius:
             start = as_found
         if here and host.kind == SPHERE and not given:
-            start = after_turn(n, _rolling(guest, host), -h)
+            start = _less_rolling(as_found, n, guest, host, h)
         lasts = dot(start, start) > 0.0
         start = start if lasts else n
         arc, first_arc = _arcs(guest, 1.0, n, start, arcs, c, 0)
@@ -300,11 +300,17 @@ def _slide(one, two, h, dt):
 
 
 @inlined
-def _rolling(guest, host):
-    """The angular velocity with which the line between two spheres turns where they roll on each other, or turn as one
-    body."""
-    share, u = guest.radius / (guest.radius + host.radius), guest.spin
-    return plus((share * u[0], share * u[1], share * u[2]), 1.0 - share, host.spin)
+def _less_rolling(start, end, guest, host, h):
+    """The normal of the end of two spheres, turned back by what they roll on each other, or turn as one body, of the
+    way from that of the start: at most to this."""
+    share, spin, turn = guest.radius / (guest.radius + host.radius), guest.spin, cross(start, end)
+    rolls = plus((share * spin[0], share * spin[1], share * spin[2]), 1.0 - share, host.spin)
+    part, whole = h * dot(rolls, turn), dot(turn, turn)
+    if not part > 0.0:
+        return end
+    part = 1.0 if part > whole else part / whole
+    n = plus(end, part, plus(start, -1.0, end))
+    return plus(_ZERO, 1.0 / np.sqrt(dot(n, n)), n)
 
 
 @inlined
