@@ -60,8 +60,7 @@ class Bodies(Tabular):
         """The bodies of the given rows (index array, mask or slice)."""
         if isinstance(rows, slice):
             return Bodies(**{name: column[rows] for name, column in self.columns().items()})
-        rows = np.asarray(rows)
-        index = np.flatnonzero(rows) if rows.dtype == bool else rows
+        index: Ints = np.arange(len(self))[rows]
         return Bodies(**{name: column.take(index, axis=0) for name, column in self.columns().items()})
 
 

@@ -6,7 +6,7 @@ is not compiled again. What other scenes need is compiled at their first step.
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 import time
 from collections.abc import Callable
@@ -116,6 +116,7 @@ KINDS: dict[str, Callable[[], None]] = {
 
 
 def main() -> None:
+    argparse.ArgumentParser(prog="python -m pctt.compile", description=__doc__.partition("\n")[0]).parse_args()
     began = time.perf_counter()
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:  # each process has an MPI of its own
         running = {pool.submit(kind): name for name, kind in KINDS.items()}
@@ -125,6 +126,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        sys.exit(f"pctt.compile: {sys.argv[1]}: no such option; it has none")
     main()

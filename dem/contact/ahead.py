@@ -31,8 +31,8 @@ Phys. 23, 1977), and does no work on their mean, to second order: a ball swings 
 without loss, also where bowl and edge move.
 
 Two spheres that impulses move have a normal between both: what they roll on each other, or turn as one, is taken back
-from that of the end. A pile that turns gains no angular momentum so; with the normal of the end it would gain w dt times
-the moment of all forces of contacts in a step.
+from that of the end. So a pile that turns gains no angular momentum; with the normal of the end it would gain w dt
+times the moment of all contact forces in a step.
 
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found

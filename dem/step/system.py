@@ -221,8 +221,9 @@ class ContactSystem:
     def _impacts(self, world: World, freely: Floats, eased: tuple[Keys, Floats] | None, b: Floats) -> Bools:
         """Which contacts (nc,) are impacts: they bounce, or `dem.step.impacts` gives them the speed with which they
         part. By b (nc, 3) they part so."""
-        self.at_once, self._bounces, self._freely = 0, np.zeros(len(b), np.bool_), freely
+        self.at_once, self._bounces = 0, np.zeros(len(b), np.bool_)
         if world.pairs.bounces:
+            self._freely = freely
             self._bounce(world, freely[:, 0], eased, b)
         parting = self.contacts.parting
         if parting is None:

@@ -25,6 +25,7 @@ from test_pages import blocks, stored_problem
 from validate import CHECKS
 
 from pctt import export, plot, render
+from pctt.compile import main as loops_ahead
 from pctt.ksp_options import OF_SOLVERS
 from pctt.options import describe
 from pctt.run.help import help_text
@@ -208,6 +209,8 @@ def test_the_words_of_a_line_are_right(page, program, text, folder, monkeypatch,
     elif program in LOOK:
         rest = parsed(lambda: LOOK[program].main(MPI.COMM_SELF), words, monkeypatch, capsys)
         assert not rest
+    elif program == "compile":
+        assert parsed(loops_ahead, words, monkeypatch, capsys) == []
     else:
         script = ROOT / program
         assert os.access(script, os.X_OK)
