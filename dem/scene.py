@@ -214,7 +214,7 @@ class Scene:
         #: Names of large bodies that go away from the grains: their speed asks for no stiffness. A simulation refuses
         #: names that no large body has.
         self.leaving: set[str] = set()
-        self._law = contact_law.law({"friction": friction, **law})
+        self._law = contact_law.law({"friction": friction, **law}, beside=[*signature(Scene).parameters][:-1])
         self._pairs: dict[tuple[int, int], ContactLaw] = {}
         self._materials: dict[str, int] = {}
         self.parts: list[Part] = []  #: the grains, as they were added
