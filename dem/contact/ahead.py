@@ -30,6 +30,9 @@ along the normal at the place between two velocities, as in the method SHAKE (Ry
 Phys. 23, 1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge,
 without loss, also where bowl and edge move.
 
+Of a sphere that comes to a body of prescribed motion the normal at the time of touch is told beside that of the end: it
+bounces along that (`Contacts.touched`).
+
 Of two spheres that impulses move the normal of the end is turned back by what both turn together, at most to that of
 the start. So a pile that turns gains no angular momentum; with the normal of the end it would gain w dt times the
 moment of all contact forces in a step. What they roll on each other is not taken back: the torque on a mixer would be
@@ -64,6 +67,9 @@ NEAREST = 0.5
 
 #: Half thicknesses of a guest up to which a contact touches: one that comes to an edge would be held by that.
 CLOSE = 5e-5
+
+TRIES, TOUCHES = 20, 1e-9  #: of a time of touch, and the gap there in radii
+SAME = 1.0 - 1e-12  #: the cosine between normals from which on they are the same
 
 LEAST_COSINE = 0.9  #: of the angle by which the normal of a contact may turn until the end
 
@@ -126,19 +132,23 @@ def seen_from(
 @loop
 def turn_ahead(
     forms: Forms, poses: Poses, inner: Floats, course: Moving, pairs: Paired, touch: Touching, arcs: Floats
-) -> tuple[Floats, Floats, Floats, Ints, int]:
+) -> tuple[Floats, Floats, Floats, Floats, Ints, int]:
     """Give contacts (nc,) of the pairs of rows i, j (m,) of the shapes the normals of the end of a step and the places
     of its start, of bodies of prescribed motion those of its end: `point` is as seen from the present place of body i.
     Returns (nc, 3) from body j to where it is relative to i for that [m]; by how much (nc, 3) the mean velocities of
-    surfaces along each other, of j relative to i, differ from those with these arms [m/s]; and the gaps (nc,) from
-    which gaps that are linear in the velocities lead to those of the end [m]. Contacts of guests in the places of
-    `seen_from` get these as their `gap`; returns also which of them overlap by more than DEEP so, and how many contacts
-    have a gap that is wider than the reach of their pair.
+    surfaces along each other, of j relative to i, differ from those with these arms [m/s]; the gaps (nc,) from which
+    gaps that are linear in the velocities lead to those of the end [m]; and `touched` (nc, 4). Contacts of guests in
+    the places of `seen_from` get these gaps as their `gap`; returns also which of them overlap by more than DEEP so,
+    and how many contacts have a gap that is wider than the reach of their pair.
+
+    Where an open sphere closes with a body of prescribed motion, `touched` are its normal at the time of touch, and
+    that time after the start [s]; zeros where that normal is the one of the end, or none is known.
 
     `arcs` (nc, 4, 3) are as of `dem.contact.convex.arcs_of`; empty without such shapes."""
     (kind, row, size, _), (center, quaternion), (place, _, _, dt) = forms, poses, course
     (i, j, pair, reach), (point, normal, gap, lasting) = pairs, touch
     moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
+    touched = np.zeros((len(pair), 4))
     deep, found, wide = np.empty(len(pair), np.int64), 0, 0
     for c in range(len(pair)):
         one, two = i[pair[c]], j[pair[c]]
@@ -188,6 +198,18 @@ def turn_ahead(
             seat = plus(seat, linear[c], n)
             other = seat if host.moves else other
 
+        if guest.kind == SPHERE and given and not lasts:
+            time, at_touch = dt, n
+            if here:
+                time, at_touch = _touch(guest, host, between, as_found, gap[c], dt, quaternion[b], size[b])
+            elif linear[c] > 0.0 and end < 0.0:  # on its host as at the end
+                time = h * linear[c] / (linear[c] - end)
+                at_touch = after_turn(n, host.spin, time - h)
+            if time < dt and dot(at_touch, n) < SAME:
+                for k in range(3):
+                    touched[c, k] = sign * at_touch[k]
+                touched[c, 3] = time
+
         own, their = Arms(core, arm, arc, first_arc), Arms(seat, other, bow, first_bow)
         more = _swing((guest, own), (host, their), n, early, h, dt)
 
@@ -204,7 +226,7 @@ def turn_ahead(
             swing[c, k] = sign * more[k]
     for c in range(len(pair)):
         wide += gap[c] > reach[pair[c]]
-    return moved, swing, linear, deep[:found], wide
+    return moved, swing, linear, touched, deep[:found], wide
 
 
 class Side(NamedTuple):
@@ -245,6 +267,28 @@ def _turned_to_end(guest, host, between, h, quaternion, size):
     n, gap = _from_host(way, host.kind, quaternion, size, guest.radius, host.spin, h)
     other = plus(plus(host.center if host.kind == SPHERE else beside, 1.0, way), guest.radius + gap, n)
     return n, gap, plus(guest.center, guest.radius, n), other
+
+
+@inlined
+def _touch(guest, host, between, normal, gap, dt, quaternion, size):
+    """When a sphere touches its host that has this normal and gap at the start, and with which normal; dt if it does
+    not within the step, or goes further than its radius. Gaps are convex in time or nearly so: by false position."""
+    begin, end, before = 0.0, dt, gap
+    drift = plus(_velocity_at(guest, guest.center), -1.0, host.velocity)
+    _, after, _, _ = _turned_to_end(guest, host, between, dt, quaternion, size)
+    if before <= 0.0 or after >= 0.0 or dt * dt * dot(drift, drift) > guest.radius * guest.radius:
+        return dt, normal
+    time, n = dt, normal
+    for _ in range(TRIES):
+        time = begin + (end - begin) * before / (before - after)
+        n, now, _, _ = _turned_to_end(guest, host, between, time, quaternion, size)
+        if abs(now) <= TOUCHES * guest.radius:
+            break
+        if now < 0.0:
+            end, after = time, now
+        else:
+            begin, before = time, now
+    return time, n
 
 
 @inlined

@@ -232,7 +232,7 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
 
 def touches_ahead(
     table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course, grains: int
-) -> tuple[Manifold, Floats, Floats, Floats]:
+) -> tuple[Manifold, Floats, Floats, Floats, Floats]:
     """The contacts as `turn_ahead` gives them directions of the end of a step, and what this returns of them; the first
     rows of bodies, so many, are `grains`. A deep gap is no deeper than the pair overlaps at the start, and none is
     wider than `delta` there."""
@@ -240,7 +240,7 @@ def touches_ahead(
     touch = (*found.touch, lasting(table, i, j, delta, found, course, grains))
     given = *table.tables(), course[:], (i, j, found.pair, delta), touch
     arcs = arcs_of(*given, table.supports[:]) if table.curved else np.zeros((0, 4, 3))
-    moved, swing, linear, deep, wider = turn_ahead(*given, arcs)
+    moved, swing, linear, touched, deep, wider = turn_ahead(*given, arcs)
     if len(deep):
         pairs, row = np.unique(found.pair[deep], return_inverse=True)
         now, least = touches(table, i[pairs], j[pairs], delta[pairs]), delta[pairs]
@@ -249,8 +249,8 @@ def touches_ahead(
     if wider:
         wide = found.touch.gap > delta[found.pair]
         found = Manifold(found.pair[~wide], found.feature[~wide], found.touch.take(~wide))
-        moved, swing, linear = moved[~wide], swing[~wide], linear[~wide]
-    return found, moved, swing, linear
+        moved, swing, linear, touched = moved[~wide], swing[~wide], linear[~wide], touched[~wide]
+    return found, moved, swing, linear, touched
 
 
 def lasting(

@@ -59,6 +59,9 @@ class Contacts:
     #: (nc, 3) by how much the mean velocities along the surfaces in the step, of b relative to a, differ from those
     #: with these arms, as bodies turn; None: nothing [m/s]
     swing: Floats | None = None
+    #: (nc, 4) of spheres that come to bodies of prescribed motion the normal at the time of touch, and that time after
+    #: the start of the step [s], or zeros; None: nowhere, or `dem.step.impacts` has taken it
+    touched: Floats | None = None
     drift: Floats | None = None  #: (nc, 3) what the shear adds to the velocity of b relative to a; None: nothing [m/s]
     #: (nc,) the normal velocities after impacts that `dem.step.impacts` follows; -inf where two do not meet, NaN where
     #: nothing is followed; None: nowhere [m/s]
@@ -79,7 +82,8 @@ class Contacts:
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row per contact by name, without copies."""
         left = {"near", "shifts", "owned", "lists", "lag", "held_overlap", "frame"}
-        left |= {name for name in ("moved", "linear", "swing", "drift", "parting") if getattr(self, name) is None}
+        maybe = "moved", "linear", "swing", "touched", "drift", "parting"
+        left |= {name for name in maybe if getattr(self, name) is None}
         return {name: value for name, value in vars(self).items() if name not in left}
 
     @property
@@ -219,8 +223,8 @@ def _narrow(
         return touches(table, *pairs), {}
     motions = _motions(world, near, images, free.prescribed)
     course = Course(near.bodies.position, motions, bodies.is_dynamic(near.bodies), free.dt)
-    found, moved, swing, linear = touches_ahead(table, *pairs, course, near.grains + near.ghosts)
-    return found, {"moved": moved, "swing": swing, "linear": linear}
+    found, moved, swing, linear, touched = touches_ahead(table, *pairs, course, near.grains + near.ghosts)
+    return found, {"moved": moved, "swing": swing, "linear": linear, "touched": touched}
 
 
 def _put_in_order(world: World, contacts: Contacts, pair: Ints, whole: bool) -> None:

@@ -63,6 +63,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     faster than `slowest`; without restitution those of two that are near no other. Two spheres that pass each
     other have no contact that closes. In cells that deform, and where bodies attract each other, nothing is
     followed."""
+    touched, contacts = contacts.touched, replace(contacts, touched=None)
     if world.cell.moves or world.pairs.attracts or not world.any_spheres:
         return contacts
     near, table, pairs, dt = contacts.near, contacts.near.bodies, world.pairs, motion.dt
@@ -75,7 +76,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     if world.cell.periodic:
         image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     radius = np.ascontiguousarray(table.size[:, 0])
-    slow = np.full(len(contacts), dt * math.hypot(*world.gravity))
+    surface, slow = np.zeros((0, 3)), np.full(len(contacts), dt * math.hypot(*world.gravity))
     if pairs.bounces:
         old = old.copy()
         old[grains:] = motion.prescribed
@@ -83,9 +84,12 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         forced = free[:, :3] - old[:, :3]
         closing = np.einsum("ci,ci->c", contacts.normal, forced[contacts.a] - forced[contacts.b])
         slow = slowest(world, contacts, dt, closing, forced)
+        if touched is not None:
+            contacts = _where_they_touch(world, contacts, touched, (ball, radius), old, (pairs.restitution, slow))
+        surface = _surfaces(contacts, old)
     kind, bounce, offset, marked = struck(
         (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
-        (ball, table.mass, radius, table.material), (table.position, old),
+        (ball, table.mass, radius, table.material), (table.position, old, surface),
         (pairs.restitution, pairs.stiffness), grains, image, dt, slow,
     )  # fmt: skip
     if not on_any(world.comm, bool(marked.any()))[0]:
@@ -97,10 +101,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         forced = free[:, :3] - old[:, :3]
     columns = (table.position, free, forced, radius[:, None], table.mass[:, None], table.inertia[:, :1])
     body, of = np.concatenate(columns, axis=1), rows[chosen]
-    arm = contacts.point[chosen] - table.position[of[:, 1]]
-    if contacts.moved is not None:
-        arm -= contacts.moved[chosen]
-    surface = free[of[:, 1], :3] + np.cross(free[of[:, 1], 3:], arm)
+    surface = _surfaces(contacts.take(chosen), free)
     given = (contacts.linear_gap, bounce, contacts.friction, kind, slow)
     contact = np.concatenate(
         [offset[chosen], contacts.normal[chosen], surface, *(x[chosen, None] for x in given)], axis=1
@@ -121,6 +122,39 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     of_grains = np.zeros((near.grains, 3))
     of_grains[row[own]] = lag[own]
     return _with_impacts(contacts, chosen, [x[here] for x in found], late, of_grains, dt)
+
+
+def _surfaces(contacts: Contacts, velocity: Floats) -> Floats:
+    """The velocities (nc, 3) of the second bodies in their contacts, where bodies have these (rows, 6)."""
+    moved = 0.0 if contacts.moved is None else contacts.moved
+    arm = contacts.point - contacts.near.bodies.position[contacts.b] - moved
+    return velocity[contacts.b, :3] + np.cross(velocity[contacts.b, 3:], arm)
+
+
+def _where_they_touch(
+    world: World, contacts: Contacts, touched: Floats, balls: tuple[Bools, Floats], velocity: Floats,
+    laws: tuple[Floats, Floats],
+) -> Contacts:  # fmt: skip
+    """The contacts with normal, arms and gap of the place of touch, as `touched` (nc, 4) says, of balls (rows,), with
+    radii (rows,), that bounce from bodies of prescribed motion: those that come by these velocities (rows, 6) faster
+    than the second of the `laws`, `slow` (nc,), also along the normal of the end. A ball that rolls from one face to
+    the next has none there."""
+    (ball, radius), (restitution, slow), table = balls, laws, contacts.near.bodies
+    material, a, b = table.material, contacts.a, contacts.b
+    coming = np.einsum("ci,ci->c", contacts.normal, _surfaces(contacts, velocity) - velocity[a, :3]) < -slow
+    rows = np.flatnonzero(ball[a] & touched.any(axis=1) & coming & (restitution[material[a], material[b]] > 0.0))
+    if not len(rows) or contacts.moved is None:
+        return contacts
+    a, b, n, time = a[rows], b[rows], touched[rows, :3], touched[rows, 3]
+    changed = (contacts.point, contacts.normal, contacts.moved, contacts.linear_gap)
+    point, normal, moved, linear = (column.copy() for column in changed)
+    normal[rows], point[rows] = n, table.position[a] + radius[a, None] * n
+    to_image = world.cell.whole(moved[rows]) if world.cell.periodic else 0.0
+    moved[rows] = to_image + time[:, None] * (velocity[b, :3] - velocity[a, :3])
+    found = replace(contacts, point=point, normal=normal, moved=moved)
+    comes = (_surfaces(found.take(rows), velocity) - velocity[a, :3]) * n
+    linear[rows] = -time * comes.sum(axis=1)
+    return replace(found, linear=linear)
 
 
 def _with_impacts(
@@ -168,15 +202,15 @@ def _reached(world: World, contacts: Contacts, rows: Ints, kind: Ints, marked: B
 
 @loop
 def struck(
-    contacts: Touching, linear: Floats, spheres: Spheres, motions: tuple[Floats, Floats], laws: tuple[Floats, Floats],
-    grains: int, image: Floats, dt: float, slow: Floats,
+    contacts: Touching, linear: Floats, spheres: Spheres, motions: tuple[Floats, Floats, Floats],
+    laws: tuple[Floats, Floats], grains: int, image: Floats, dt: float, slow: Floats,
 ) -> tuple[Ints, Floats, Floats, Bools]:  # fmt: skip
     """Of contacts (nc,) the kinds (nc,), the coefficients of restitution (nc,)
     and the ways from the second bodies to their images (nc, 3), of spheres `image`; and which bodies (rows,) meet by
-    the velocities before the step, faster than `slow` (nc,), or pass each other while the linear gap closes. Those that
-    press others that they touch are left out."""
+    the velocities before the step, of second ones in their contacts the third of `motions` (nc, 3), faster than `slow`
+    (nc,), or pass each other while the linear gap closes. Those that press others that they touch are left out."""
     (one, two, normal, gap), (ball, mass, radius, material) = contacts, spheres
-    (place, velocity), (restitution, stiffness) = motions, laws
+    (place, velocity, surface), (restitution, stiffness) = motions, laws
     count = len(one)
     kind, bounce, offset = np.empty(count, np.int64), np.empty(count), np.zeros((count, 3))
     kind[:] = OTHER
@@ -192,6 +226,7 @@ def struck(
         v = velocity[b, 0] - velocity[a, 0], velocity[b, 1] - velocity[a, 1], velocity[b, 2] - velocity[a, 2]
         closed, closes, bounce[c] = gap[c] <= 0.0, linear[c] + dt * dot(v, n) < 0.0, e
         if ball[a] and b >= grains and e > 0.0 and np.isinf(mass[b]):
+            v = surface[c, 0] - velocity[a, 0], surface[c, 1] - velocity[a, 1], surface[c, 2] - velocity[a, 2]
             kind[c], meets[c] = WALL, closes and dot(v, n) < -slow[c]
         elif ball[a] and ball[b] and (e > 0.0 or (many[a] == many[b] == 1 and _is_short(k, mass, a, b, dt))):
             offset[c] = image[c]

@@ -8,8 +8,9 @@ from mpi4py import MPI
 
 import pctt
 from dem.mesh import Mesh
+from dem.motion import Rotation
 from dem.scene import Scene
-from dem.shapes import Box, Plane
+from dem.shapes import Box, Plane, Sphere
 
 R, DENSITY = 0.01, 2500.0
 EXACT = {"tol": 1e-9, "closing_work": np.inf, "delta": 0.05 * R}
@@ -157,3 +158,49 @@ def test_ranks_follow_the_same_impacts(ranks):
             found.append((sim.positions, sim.velocities))
     for one, other in zip(*found):
         np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+HOSTS = {
+    "sphere": (Sphere(3 * R), 4 * R),
+    "edge of a box": (Box((1.0, 1.0, 1.0), center=(1.0, -1.0, 0.0)), R),
+}
+
+
+@pytest.mark.parametrize("host", HOSTS)
+@pytest.mark.parametrize("mu", [0.0, 0.2])
+def test_a_ball_bounces_off_a_curved_body_where_it_touches_that(host, mu):
+    """Its normal there, not that of the end of the step, which at an edge was 10 degrees off."""
+    shape, reach = HOSTS[host]
+    n, coming = np.array([0.8, -0.6, 0.0]), np.array([1.0, 0.0, 0.0])
+    along = np.array([0.6, 0.8, 0.0])
+    push, slide = 1.5 * 0.8, 0.6
+    rub = min(mu * push, 2 / 7 * slide)
+    after = coming - push * n - rub * along
+    for way, phase in ((0.2, 0.05), (0.2, 0.95), (0.6, 0.5)):
+        dt = way * R
+        scene = Scene(friction=mu, gravity=(0, 0, 0), restitution=0.5)
+        scene.add_body("host", [shape])
+        scene.add_spheres([-reach * n - dt * (1 + phase) * coming], R, DENSITY, velocity=coming)
+        with pctt.Simulation(scene, dt=dt, stiffness=np.inf, **EXACT) as sim:
+            sim.run(steps=4)
+            np.testing.assert_allclose(sim.velocities[0, :3], after, atol=1e-5)
+            place = -reach * n + dt * (3 - phase) * after
+            np.testing.assert_allclose(sim.positions[0], place, atol=1e-5 * R)
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.3])
+def test_a_turning_paddle_strikes_a_ball_along_its_face_of_that_time(mu):
+    """It parts with (1 + e) times the speed of the face, along the normal of the time of touch: not .02 off."""
+    speed, far, thick, e = 3.0, 25 * R, 2 * R, 0.5
+    for turn in (0.4, 0.405, 0.41):
+        out = np.array([np.cos(turn), np.sin(turn), 0.0])
+        ahead = np.array([-out[1], out[0], 0.0])
+        scene = Scene(friction=mu, gravity=(0, 0, 0), restitution=e)
+        scene.add_body("paddle", [Box((30 * R, thick, 10 * R))], Rotation((0, 0, speed)))
+        scene.add_spheres([far * out + (thick + R) * ahead], R, DENSITY)
+        with pctt.Simulation(scene, dt=0.02 / speed, **EXACT) as sim:
+            sim.run(until=turn / speed + 0.03)
+            found = sim.velocities[0, :3]
+        push = (1 + e) * speed * far
+        rub = min(mu * push, 2 / 7 * speed * thick)
+        np.testing.assert_allclose(found, push * ahead - rub * out, atol=2e-3 * push)
