@@ -84,8 +84,9 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         forced = free[:, :3] - old[:, :3]
         closing = np.einsum("ci,ci->c", contacts.normal, forced[contacts.a] - forced[contacts.b])
         slow = slowest(world, contacts, dt, closing, forced)
-        if touched is not None:
-            contacts = _where_they_touch(world, contacts, touched, (ball, radius), old, (pairs.restitution, slow))
+    if touched is not None:
+        contacts = _where_they_touch(world, contacts, touched, motion.prescribed, (ball, radius, slow))
+    if pairs.bounces:
         surface = _surfaces(contacts, old)
     kind, bounce, offset, marked = struck(
         (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
@@ -132,28 +133,29 @@ def _surfaces(contacts: Contacts, velocity: Floats) -> Floats:
 
 
 def _where_they_touch(
-    world: World, contacts: Contacts, touched: Floats, balls: tuple[Bools, Floats], velocity: Floats,
-    laws: tuple[Floats, Floats],
-) -> Contacts:  # fmt: skip
-    """The contacts with normal, arms and gap of the place of touch, as `touched` (nc, 4) says, of balls (rows,), with
-    radii (rows,), that bounce from bodies of prescribed motion: those that come by these velocities (rows, 6) faster
-    than the second of the `laws`, `slow` (nc,), also along the normal of the end. A ball that rolls from one face to
-    the next has none there."""
-    (ball, radius), (restitution, slow), table = balls, laws, contacts.near.bodies
-    material, a, b = table.material, contacts.a, contacts.b
-    coming = np.einsum("ci,ci->c", contacts.normal, _surfaces(contacts, velocity) - velocity[a, :3]) < -slow
-    rows = np.flatnonzero(ball[a] & touched.any(axis=1) & coming & (restitution[material[a], material[b]] > 0.0))
+    world: World, contacts: Contacts, touched: Floats, prescribed: Floats, balls: tuple[Bools, Floats, Floats]
+) -> Contacts:
+    """The contacts with normal, arms and gap of the place of touch, as `touched` (nc, 4) says, of `balls` (rows,), with
+    radii (rows,), that come to bodies of the `prescribed` velocities (large, 6), along the normal of the end, too,
+    faster than the last of the three, `slow` (nc,). A ball that rolls from one face to the next does not."""
+    (ball, radius, slow), table, near = balls, contacts.near.bodies, contacts.near
+    rows = np.flatnonzero(touched[:, :3].any(axis=1) & ball[contacts.a])
     if not len(rows) or contacts.moved is None:
         return contacts
-    a, b, n, time = a[rows], b[rows], touched[rows, :3], touched[rows, 3]
+    velocity = table.velocity.copy()
+    velocity[near.grains + near.ghosts :] = prescribed
+    these = contacts.take(rows)
+    comes = _surfaces(these, velocity) - velocity[these.a, :3]
+    rows = rows[np.einsum("ci,ci->c", these.normal, comes) < -slow[rows]]
+    a, b, n, time = contacts.a[rows], contacts.b[rows], touched[rows, :3], touched[rows, 3]
     changed = (contacts.point, contacts.normal, contacts.moved, contacts.linear_gap)
     point, normal, moved, linear = (column.copy() for column in changed)
     normal[rows], point[rows] = n, table.position[a] + radius[a, None] * n
     to_image = world.cell.whole(moved[rows]) if world.cell.periodic else 0.0
     moved[rows] = to_image + time[:, None] * (velocity[b, :3] - velocity[a, :3])
     found = replace(contacts, point=point, normal=normal, moved=moved)
-    comes = (_surfaces(found.take(rows), velocity) - velocity[a, :3]) * n
-    linear[rows] = -time * comes.sum(axis=1)
+    comes = _surfaces(found.take(rows), velocity) - velocity[a, :3]
+    linear[rows] = -time * np.einsum("ci,ci->c", n, comes)
     return replace(found, linear=linear)
 
 
