@@ -62,6 +62,7 @@ class Source(Named, Timed):
             raise ValueError(f"shape of a source: allowed is a Box or a Capsule, got {type(self.shape).__name__}")
         if not self.most >= 1:
             raise ValueError(f"most grains of a source must be at least 1, got {self.most:g}")
+        checks.seed("seed of a source", self.seed)
         checks.check_fields(self, velocity=checks.vector)
 
     @property

@@ -130,6 +130,9 @@ def test_inserted_spheres_are_apart(period):
     ({"start": 2.0, "end": 1.0}, "Source cannot begin at 2 s and end at 1 s"),
     ({"most": 0}, "at least 1"),
     ({"shape": "box"}, "allowed is a Box or a Capsule"),
+    ({"seed": 1.5}, "seed of a source 1.5: allowed is a whole number from 0 on"),
+    ({"seed": -1}, "seed of a source -1: allowed is"),
+    ({"seed": None}, "seed of a source None: allowed is"),
 ])  # fmt: skip
 def test_bad_sources_are_refused(given, words):
     with pytest.raises(ValueError, match=words):

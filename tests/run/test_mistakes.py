@@ -97,6 +97,62 @@ def test_unused_materials_and_rolling_of_more_than_a_radius_are_told():
         Simulation(scene)
 
 
+def bare(friction=0.5, density=1500.0, **law):
+    scene = Scene(friction, **law)
+    scene.add_spheres([0, 0, 0.3], 0.05, density)
+    return scene
+
+
+def floored(**given):
+    scene = bare(**given)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    return scene
+
+
+def poured():
+    scene = floored()
+    region = measures.Block((0, 0, 1), (1, 1, 2))
+    scene.add_source("rain", region, radius=0.05, density=2.5, number_rate=1.0)
+    return scene
+
+
+def walled():
+    scene = bare()
+    scene.add_body("walls", [Plane((1, 0, 0), (-1, 0, 0)), Plane((0, -1, 0), (0, 1, 0))])
+    return scene
+
+
+def hung():
+    scene = bare()
+    scene.add_spring("rope", None, 0, stiffness=10.0)
+    return scene
+
+
+def drained():
+    scene = bare()
+    scene.add_outlet("below", measures.Block((-1, -1, -2), (1, 1, -1)))
+    return scene
+
+
+@pytest.mark.parametrize(("scene", "words"), [
+    (floored(density=2.5), "a density of 2.5 kg/m.3: is it in g/cm.3"),
+    (poured(), "a density of 2.5 kg/m.3: is it in g/cm.3"),
+    (floored(friction=30.0), "friction 30: is it an angle in degrees"),
+    (floored(static_friction=26.6), "friction 26.6: is it an angle in degrees"),
+    (bare(), "the grains fall for ever, as no part of a large body is below them: a floor is"),
+    (walled(), "the grains fall for ever"),
+    (floored(stiffness=1.0), "contacts are so soft that .* half thicknesses. What helps: a larger stiffness="),
+    (floored(), ""), (floored(friction=1e6), ""), (hung(), ""), (drained(), ""), (bare(gravity=(0, 0, 0)), ""),
+])  # fmt: skip
+def test_what_is_likely_a_mistake_is_told_before_the_first_step(scene, words):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", UserWarning)
+        Simulation(scene)
+    found = [str(each.message) for each in told if each.category is UserWarning]
+    assert len(found) == bool(words), found
+    assert all(re.match(words, each) for each in found), found
+
+
 def test_a_scene_that_a_simulation_has_stays_as_it_is():
     """Its copy does not."""
     scene = falling()
