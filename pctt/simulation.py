@@ -43,7 +43,7 @@ from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.start import step_remark
 from dem.start.doubts import doubts
 from dem.start.time_step import fall_remark, reason, smallest
-from dem.start.tools import SwingWatch
+from dem.start.tools import PaceWatch, SwingWatch
 from dem.start.turns import TurnWatch
 from dem.step import Step
 from dem.step.impulses import ImpulseMemory
@@ -137,7 +137,8 @@ class Simulation:
             warn(comm, large)
         if likely := "" if restart else comm.bcast(doubts(scene)):
             warn(comm, likely)
-        self._watches = TurnWatch(), SwingWatch(), LooseWatch(smallest(scene))
+        half = smallest(scene)
+        self._watches = TurnWatch(), SwingWatch(), PaceWatch(half, scene.leaving), LooseWatch(half)
         self._tell_turns()
         self._begun = restart
         self.restart = "" if isinstance(restart, state.RunState) else str(restart)  #: the file from which it goes on
@@ -255,7 +256,7 @@ class Simulation:
             warn(self.comm, report.unsolved_words(self.figures))
 
     def _tell_turns(self) -> None:
-        """Warn of a body that turns or swings too far in a step, or of a joint that does not hold; collective."""
+        """Warn of a body that goes, turns or swings too far in a step, or of a joint that does not hold; collective."""
         for watch in self._watches:
             if words := watch.look(self.world, self.settings.dt):
                 warn(self.comm, words)

@@ -106,7 +106,7 @@ class Joint(Constraint):
                     f"{name} of a hinge, {angle:g} rad: allowed are angles from -pi to pi; a motor with a speed, and "
                     "without limits, turns further"
                 )
-        if not KINDS[self.kind].motor and (self.driven or np.isfinite([self.low, self.high]).any()):
+        if not KINDS[self.kind].motor and (self.driven or np.isfinite([self.strength, self.low, self.high]).any()):
             raise ValueError(f"a {self.kind} joint has no motor and no limits: allowed are those of hinges and sliders")
 
     def refuse(self, name: str, world: Any) -> None:

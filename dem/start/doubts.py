@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from dem.bodies import bounding_radius
+from dem.mesh import Mesh
 from dem.start.falls import ends
 
 if TYPE_CHECKING:
     from dem.scene import Scene
 
+HUGE = 50.0  #: lengths of the bed; in millimetres a mesh as long as a twentieth of it is longer
 LIGHT = 10.0  #: less than foams have [kg/m^3]; solids have 0.5 to 22.6 g/cm^3
 
 
 def doubts(scene: Scene) -> str:
-    """What is likely a mistake, in words: of materials and laws, of the density, of what bears the grains; empty if
-    there is nothing."""
-    return "; ".join(filter(None, (scene.doubts(), _light(scene), _bottomless(scene))))
+    """What is likely a mistake, in words: of materials, laws, densities, sizes, of what bears grains; empty if nothing
+    is."""
+    return "; ".join(filter(None, (scene.doubts(), _light(scene), _huge(scene), _bottomless(scene))))
 
 
 def _light(scene: Scene) -> str:
@@ -24,6 +27,19 @@ def _light(scene: Scene) -> str:
     given = [float(part.given["density"].sample().min(initial=math.inf)) for part in scene.parts]
     least = min(given + [source.density for source in scene.passages.sources.values()], default=math.inf)
     return f"a density of {least:.3g} kg/m^3: is it in g/cm^3, which are 1000 kg/m^3?" if least < LIGHT else ""
+
+
+def _huge(scene: Scene) -> str:
+    """Of a mesh whose file is in millimetres, beside the grains at time zero."""
+    if not scene.count:
+        return ""
+    grains = scene.survey()
+    most = HUGE * float((grains.high - grains.low).max() + 2.0 * bounding_radius(grains.extremes).max())
+    sizes = {body.name: 2.0 * float(shape.surface.half.max()) for body in scene.large_bodies for shape in body.shapes
+             if isinstance(shape, Mesh)}  # fmt: skip
+    found = [f"the mesh of {name!r} is {size:.3g} m long: is it in mm, scale=1e-3?" for name, size in sizes.items()
+             if size > most]  # fmt: skip
+    return "; ".join(found)
 
 
 def _bottomless(scene: Scene) -> str:

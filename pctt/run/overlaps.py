@@ -8,7 +8,8 @@ import numpy as np
 
 from dem.scene import Scene, least_half
 from dem.start.stiffness import expected_overlap
-from dem.start.time_step import DRIVEN, smallest
+from dem.start.time_step import smallest
+from dem.start.tools import DRIVEN
 from dem.step import Step
 from dem.step.overlaps import overlaps
 from pctt.run.report import remedy

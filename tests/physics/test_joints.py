@@ -541,6 +541,7 @@ def test_a_body_that_is_squeezed_against_its_joint_has_no_solution():
         ({"target": 4.0}, "target of a hinge, 4 rad: allowed are angles from -pi to pi"),
         ({"limits": (-1.0, 3.2)}, "high of a hinge, 3.2 rad"),
         ({"limits": (-4.0, 1.0), "speed": 1.0}, "low of a hinge, -4 rad"),
+        ({"kind": "ball", "strength": 5.0}, "a ball joint has no motor and no limits"),
         ({"limits": (0.5, 1.0)}, "limits of 'axle', 0.5 to 1: allowed are those about 0, where it is at time zero"),
     ],
 )
