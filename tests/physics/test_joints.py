@@ -534,7 +534,7 @@ def test_a_body_that_is_squeezed_against_its_joint_has_no_solution():
     ("given", "words"),
     [
         ({"kind": "rope"}, "kind of a joint"),
-        ({"speed": 1.0, "target": 1.0}, "not both"),
+        ({"speed": -1.0, "target": 1.0}, "speed of a motor with a target, -1: allowed is the greatest, above zero"),
         ({"kind": "ball", "speed": 1.0}, "no motor"),
         ({"limits": (1.0, 0.0)}, "limits"),
         ({"strength": -1.0}, "strength"),
@@ -613,6 +613,27 @@ def test_a_joint_of_bodies_that_no_force_moves_is_refused():
     words = "joint 'pin': the motions of the world and 'sled' are prescribed, so it holds nothing; allowed is one body"
     with pytest.raises(OptionError, match=words):
         simulation(scene)
+
+
+@pytest.mark.parametrize("strength", [np.inf, 100.0])
+def test_a_motor_goes_to_its_target_at_its_greatest_speed(strength):
+    """Another target keeps that speed; a speed alone is kept, and a target alone after it has none."""
+    sim = simulation(wheel(target=0.5, speed=2.0, strength=strength), dt=0.01)
+    axle = sim.joint("axle")
+    sim.run(until=0.2)
+    assert (axle.speed, axle.angle) == pytest.approx((2.0, 0.4), rel=2e-2)
+    sim.run(until=0.5)
+    assert (axle.speed, axle.angle) == pytest.approx((0.0, 0.5), abs=1e-6)
+    sim.change("joint axle", target=-0.5)
+    sim.run(steps=20)
+    assert (axle.speed, axle.angle) == pytest.approx((-2.0, 0.1), rel=2e-2)
+    sim.change("joint axle", speed=4.0, target=-0.5)
+    sim.run(steps=10)
+    assert axle.speed == pytest.approx(-4.0, rel=2e-2)
+    sim.change("joint axle", speed=-1.0)
+    assert axle.motor.target is None
+    sim.change("joint axle", target=0.0)
+    assert axle.motor.speed is None
 
 
 @pytest.mark.parallel(1, 2)
