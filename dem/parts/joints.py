@@ -170,8 +170,8 @@ class Joint(Constraint):
         return KINDS[self.kind].coordinate
 
     def changed(self, time: float, tally: Any, **values: Any) -> Joint:
-        """As of `Named`; a `speed` alone ends a target, and a `target` alone a speed that was kept. A greatest speed stays
-        when another target comes."""
+        """As of `Named`; a `speed` alone ends a target, and a `target` alone a speed that was kept. A greatest speed
+        stays when another target comes."""
         if values.get("speed") is not None:
             values.setdefault("target", None)
         elif values.get("target") is not None and self.target is None:

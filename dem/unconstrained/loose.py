@@ -9,6 +9,7 @@ from dem.parts.ends import HELD, Constraint
 from dem.scene import kinds_of
 from dem.unconstrained.constraints import constraints_now
 
+EVERY = 10  #: steps from one look to the next: what does not hold comes further apart
 APART = 0.1  #: of a half thickness, or radians, that the sides of what is held may be apart after a step
 
 
@@ -17,11 +18,12 @@ class LooseWatch:
 
     def __init__(self, half: float) -> None:
         self._most = APART * np.repeat([half, 1.0], 3)
-        self._told = False
+        self._told, self._steps = False, 0
 
     def look(self, world: World, dt: float) -> str:
         """What to say after a step of dt [s], most often nothing; collective."""
-        kinds = [] if self._told else kinds_of(Constraint, world.named)
+        self._steps += 1
+        kinds = [] if self._told or self._steps % EVERY else kinds_of(Constraint, world.named)
         parts = [(f"{kind} {name!r}", part) for kind, _, named in kinds for name, part in named.items()]
         if not parts:
             return ""
