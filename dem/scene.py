@@ -36,10 +36,11 @@ from dem.parts.joints import Joint
 from dem.parts.loads import Law, Load, On
 from dem.parts.named import Named
 from dem.parts.passages import Outlet, Passages
+from dem.parts.sizes import Sizes
 from dem.parts.sources import Source
 from dem.parts.springs import Spring
 from dem.quaternion import across, length
-from dem.shapes import Clump, Shape, clumps, convex, polyhedra, refuse_other_than_shapes
+from dem.shapes import Box, Capsule, Clump, Shape, Sphere, clumps, convex, polyhedra, refuse_other_than_shapes
 from dem.shapes.convex import Convex
 from dem.shapes.forms import Form
 
@@ -213,7 +214,7 @@ class Scene:
         #: Names of large bodies that go away from the grains: their speed asks for no stiffness. A simulation refuses
         #: names that no large body has.
         self.leaving: set[str] = set()
-        self._law = contact_law.law({"friction": friction, **law})
+        self._law = contact_law.law({"friction": friction, **law}, beside=[*signature(Scene).parameters][:-1])
         self._pairs: dict[tuple[int, int], ContactLaw] = {}
         self._materials: dict[str, int] = {}
         self.parts: list[Part] = []  #: the grains, as they were added
@@ -549,10 +550,39 @@ class Scene:
         return self._rows(id, id + 1)
 
     @_building
-    def add_source(self, name: str, region: Block | Cylinder, *, material: str = "default", **given: Any) -> None:
-        """Let grains come in a region of `dem.measures`, where there is room; `given` are the fields of
-        `dem.parts.sources.Source`: radius [m], density [kg/m^3], mass_rate [kg/s] or number_rate [1/s], and others."""
-        self.passages.add(name, Source(region, material=self._material(material), **given))
+    def add_source(
+        self,
+        name: str,
+        region: Block | Cylinder,
+        *,
+        radius: float | Sequence[float] | Sizes | None = None,
+        density: float,
+        mass_rate: float | None = None,
+        number_rate: float | None = None,
+        most: float = np.inf,
+        material: str = "default",
+        velocity: Sequence[float] = (0.0, 0.0, 0.0),
+        shape: Sphere | Box | Capsule | Clump | Convex | ArrayLike | None = None,
+        start: float = 0.0,
+        end: float = np.inf,
+        seed: int = 0,
+    ) -> None:
+        """Let grains come in a region of `dem.measures`, where there is room, from `start` to `end` [s].
+
+        They are spheres of a `radius` [m], which may be a distribution of `dem.parts.sizes`; or have a `shape`, that
+        may also be the vertices (v, 3) of a polyhedron, times the `radius`, 1 by default; a clump has one size. Their
+        `density` [kg/m^3]; either the `mass_rate` [kg/s] or the `number_rate` [1/s]; the `most` that come in all; their
+        `velocity` (3,) at birth [m/s]; the `seed` of sizes, turns and places, see `dem.parts.sources.Source`.
+        ValueError for what is none of these.
+        """
+        own = None if shape is None else _of_grains(shape)
+        number = self._know(own) if isinstance(own, Form) else 0
+        source = Source(
+            region, radius, density=density, mass_rate=mass_rate, number_rate=number_rate, most=most,
+            material=self._material(material), velocity=velocity, shape=own, number=number, start=start, end=end,
+            seed=seed,
+        )  # fmt: skip
+        self.passages.add(name, source)
 
     @_building
     def add_outlet(self, name: str, region: Block | Cylinder, *, outside: bool = False) -> None:
@@ -712,16 +742,16 @@ class Scene:
     ) -> Ints | range:  # fmt: skip
         """Add grains of one form, whose positions and quaternions are those of the frame in which it was given; their
         ids."""
-        self._know(form)
-        solid = partial(_formed, form)
-        kind = form.BASE + self.forms.index(form)
+        kind, solid = form.BASE + self._know(form), partial(_formed, form)
         return self._append(
             kind, positions, {"scale": scale}, density, material, quaternions, velocity, angular_velocity, solid
         )
 
-    def _know(self, form: Form) -> None:
+    def _know(self, form: Form) -> int:
+        """The number of a form among those of the scene."""
         if form not in self.forms:
             self.forms.append(form)
+        return self.forms.index(form)
 
     def _append(
         self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike,
@@ -763,11 +793,27 @@ def _plain(kind: int, lengths: tuple[str, ...], given: dict[str, Floats]) -> tup
 
 def _formed(form: Form, given: dict[str, Floats]) -> tuple[Floats, ...]:
     """`Part.solid` of grains of a form."""
-    turns, rho, times = _unit(given["quaternions"]), given["density"][:, None], given["scale"][:, None]
-    centers = given["positions"] + quaternion.rotate(turns, times * form.place)
-    turns = quaternion.multiply(turns, np.tile(form.turn, (len(rho), 1)))
-    mass, inertia = (rho * times**3 * form.volume)[:, 0], rho * times**5 * form.moments
-    return centers, turns, times * form.size, mass, inertia
+    turns, scale = _unit(given["quaternions"]), given["scale"]
+    centers = given["positions"] + quaternion.rotate(turns, scale[:, None] * form.place)
+    turns = quaternion.multiply(turns, np.tile(form.turn, (len(scale), 1)))
+    return centers, turns, *form.grown(scale, given["density"])
+
+
+def _of_grains(shape: Any) -> Sphere | Box | Capsule | Form:
+    """The shape of the grains of a source, or the form of one that has some. ValueError for what is none."""
+    if isinstance(shape, (Sphere, Box, Capsule)):
+        _, center, turn, _ = shapes.placed(shape)
+        if center.any() or turn[1:].any():
+            raise ValueError("shape of a source: its center and quaternion must be those of its frame")
+        return shape
+    if isinstance(shape, Clump):
+        return clumps.form(shape)
+    if isinstance(shape, Convex):
+        return convex.form(shape)
+    if np.ndim(shape) == 0:
+        allowed = "allowed are a Sphere, Box, Capsule, Clump or convex shape such as a Cylinder, or vertices (v, 3)"
+        raise ValueError(f"shape of a source: {allowed}, got {type(shape).__name__}")
+    return polyhedra.solid(shape)
 
 
 def _unit(quaternions: Floats) -> Floats:

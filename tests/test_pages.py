@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from inspect import signature
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -16,7 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.parts.contact_law import ContactLaw
-from dem.parts.sources import Source
+from dem.scene import Scene
 from pctt import Folder, Simulation, ccp
 from pctt.ccp import fclib
 from pctt.render import Picture
@@ -195,7 +196,7 @@ def test_tables_of_coefficients_and_arguments_are_whole():
     laws = " ".join(row[0] for row in table("docs/contact_laws.md", "| coefficient | unit | default | law |"))
     assert set(re.findall(r"`(\w+)`", laws)) == {field.name for field in dataclasses.fields(ContactLaw)}
     sources = " ".join(row[0] for row in table("docs/sources.md", "| argument | default | meaning | unit |"))
-    assert set(re.findall(r"`(\w+)`", sources)) == {field.name for field in dataclasses.fields(Source)} - {"before"}
+    assert set(re.findall(r"`(\w+)`", sources)) == {*signature(Scene.add_source).parameters} - {"self", "name"}
 
 
 def test_the_defaults_of_the_limits_are_those_of_the_code():

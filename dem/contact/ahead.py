@@ -30,9 +30,10 @@ along the normal at the place between two velocities, as in the method SHAKE (Ry
 Phys. 23, 1977), and does no work on their mean, to second order: a ball swings in a bowl, and goes over an edge,
 without loss, also where bowl and edge move.
 
-Two spheres that impulses move have a normal between both: what they roll on each other, or turn as one, is taken back
-from that of the end. So a pile that turns gains no angular momentum; with the normal of the end it would gain w dt
-times the moment of all contact forces in a step.
+Of two spheres that impulses move the normal of the end is turned back by what both turn together, at most to that of
+the start. So a pile that turns gains no angular momentum; with the normal of the end it would gain w dt times the
+moment of all contact forces in a step. What they roll on each other is not taken back: the torque on a mixer would be
+9 % too large.
 
 Contacts of spheres with spheres, half spaces and boxes are found where the bodies are, and then turned. Of other pairs
 the first, the guest, is put where it will be at the end as seen from the second, the host, which stays; what is found
@@ -164,7 +165,7 @@ def turn_ahead(
         if here and given and gap[c] <= CLOSE * guest.radius:
             start = as_found
         if here and host.kind == SPHERE and not given:
-            start = _less_rolling(as_found, n, guest, host, h)
+            start = _less_common(as_found, n, guest, host, h)
         lasts = dot(start, start) > 0.0
         start = start if lasts else n
         arc, first_arc = _arcs(guest, 1.0, n, start, arcs, c, 0)
@@ -300,16 +301,14 @@ def _slide(one, two, h, dt):
 
 
 @inlined
-def _less_rolling(start, end, guest, host, h):
-    """The normal of the end of two spheres, turned back by what they roll on each other, or turn as one body, of the
-    way from that of the start: at most to this."""
-    share, spin, turn = guest.radius / (guest.radius + host.radius), guest.spin, cross(start, end)
-    rolls = plus((share * spin[0], share * spin[1], share * spin[2]), 1.0 - share, host.spin)
-    part, whole = h * dot(rolls, turn), dot(turn, turn)
-    if not part > 0.0:
+def _less_common(start, end, guest, host, h):
+    """The normal of the end of two spheres, turned back towards that of the start by what both turn together."""
+    turn = cross(start, end)
+    sine = np.sqrt(dot(turn, turn))
+    together = h * min(dot(guest.spin, turn), dot(host.spin, turn))
+    if not together > 0.0:
         return end
-    part = 1.0 if part > whole else part / whole
-    n = plus(end, part, plus(start, -1.0, end))
+    n = plus(end, min(together / sine**2, 1.0), plus(start, -1.0, end))
     return plus(_ZERO, 1.0 / np.sqrt(dot(n, n)), n)
 
 

@@ -81,7 +81,7 @@ def _new_lists(world: World, margin: Floats, travel: Floats) -> Lists:
     wide = pictures.among(near)
     seen = wide.grains + wide.ghosts
     large = [body.shapes for body in world.large_bodies]
-    table = primitives(wide, large, world.first_large, world.forms, world.initial)
+    table = primitives(wide, large, world.first_large, world.forms, world.ids)
     pairs = pictures.once(close_pairs(wide.bodies.position[:seen], table.radius[:seen] + wide.margin), wide.index)
     index = near.index[grains:count]
     owner = np.searchsorted(world.slabs, index, side="right") - 1

@@ -140,11 +140,12 @@ class Primitives(NamedTuple):
 
 
 def primitives(
-    near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int, forms: tuple[Form, ...] = (), initial: int = 0
+    near: Neighbourhood, shapes: list[tuple[Shape, ...]], grains: int, forms: tuple[Form, ...] = (), ids: int = 0
 ) -> Primitives:
     """The table of the grains and ghosts of `near` and of the `shapes` of its large bodies, for `Primitives.now`; it
-    has the places and sizes of the parts alone, in the frames of their bodies. `grains` is the number of grains on all
-    ranks, of which those with ids below `initial` may have `forms`. ValueError if there are more than have names."""
+    has the places and sizes of the parts alone, in the frames of their bodies. Grains have ids
+    below `grains`; so far those below `ids` were given away, and may have `forms`. ValueError if there are more than
+    have names."""
     table, count, hulls = near.bodies, near.grains + near.ghosts, hulls_of(forms)
     row = count + np.repeat(np.arange(len(shapes)), [len(parts) for parts in shapes])
     parts_of = [shape for body in shapes for shape in body]
@@ -158,7 +159,7 @@ def primitives(
         "kind": (table.shape, np.array(kinds, np.int64) + np.array(numbers, np.int64)),
     }
     after = grains + sum(spans)
-    last = after + more_numbers(forms, initial)
+    last = after + more_numbers(forms, ids)
     if last > (most := most_numbers(hulls.features)):
         raise ValueError(
             f"{grains} grains and {last - grains} numbers of parts of bodies: their contacts have no keys; "

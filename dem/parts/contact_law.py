@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, cast
@@ -108,11 +108,14 @@ CHANGED = ("friction", "static_friction", "restitution", "rolling", "spinning", 
            "spinning_coefficient")  # fmt: skip
 
 
-def law(values: Mapping[str, float | None], before: ContactLaw | None = None) -> ContactLaw:
-    """Return the law with these coefficients; None, and what is not given: as `before`. ValueError for a bad one."""
+def law(
+    values: Mapping[str, float | None], before: ContactLaw | None = None, beside: Sequence[str] = ()
+) -> ContactLaw:
+    """Return the law with these coefficients; None, and what is not given: as `before`. ValueError for a bad one;
+    `beside` are arguments that the user may have meant."""
     for name in values:
         if name not in CHECKS:
-            allowed = f"allowed are {', '.join(CHECKS)}{checks.nearest(name, CHECKS)}"
+            allowed = f"allowed are {', '.join(CHECKS)}{checks.nearest(name, (*CHECKS, *beside))}"
             raise ValueError(f"{name}: no such coefficient of contacts; {allowed}")
     given = {name: float(value) for name, value in values.items() if value is not None}
     return replace(before, **given) if before else ContactLaw(**given)

@@ -7,7 +7,7 @@ these. So no generator has a state, and a run that goes on from a checkpoint has
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,7 +19,8 @@ from dem.geometry.region import Block, Cylinder, refuse_region
 from dem.motion import Timed
 from dem.parts.named import Named
 from dem.parts.sizes import Listed, Sizes, Uniform, sizes
-from dem.shapes import Box, Capsule
+from dem.shapes import Box, Capsule, Sphere
+from dem.shapes.forms import Form
 from dem.together import digest
 
 TRIES = 64  #: places that are tried for a grain in a step
@@ -29,19 +30,19 @@ TRIES = 64  #: places that are tried for a grain in a step
 class Source(Named, Timed):
     """Grains come in a region, at a mass rate or a number rate, where there is room for them.
 
-    They are spheres of the sizes `radius`, or boxes or capsules whose lengths are those of `shape` times a size, turned
-    at random.
+    They are of one `shape`, whose lengths are times a size of each, and turned at random if it is no sphere.
     """
 
     region: Block | Cylinder  #: of the centres at birth
-    radius: float | Sequence[float] | Sizes  #: sizes; of spheres the radius [m]
-    density: float  #: [kg/m^3]
+    radius: float | Sequence[float] | Sizes | None = None  #: sizes; of spheres the radius [m]; None: 1
+    density: float = field(kw_only=True)  #: [kg/m^3]
     mass_rate: float | None = None  #: [kg/s]; either this
     number_rate: float | None = None  #: [1/s]; or this
     most: float = np.inf  #: grains in all
     material: int = 0
     velocity: Sequence[float] = (0.0, 0.0, 0.0)  #: at birth [m/s]
-    shape: Box | Capsule | None = None  #: None: spheres
+    shape: Sphere | Box | Capsule | Form | None = None  #: None: spheres of radius 1 m, times the sizes
+    number: int = 0  #: of a form among those of the scene
     start: float = 0.0  #: [s]
     end: float = np.inf  #: [s]
     seed: int = 0
@@ -57,9 +58,13 @@ class Source(Named, Timed):
         given = [rate for rate in (self.mass_rate, self.number_rate) if rate is not None]
         checks.not_negative("rate of a source", given)
         checks.positive("density of a source", self.density)
-        object.__setattr__(self, "radius", sizes(self.radius))
-        if self.shape is not None and not isinstance(self.shape, (Box, Capsule)):
-            raise ValueError(f"shape of a source: allowed is a Box or a Capsule, got {type(self.shape).__name__}")
+        if self.radius is None and self.shape is None:
+            raise ValueError("a source needs a shape, or the radius of its spheres [m]")
+        object.__setattr__(self, "radius", sizes(1.0 if self.radius is None else self.radius))
+        object.__setattr__(self, "shape", Sphere(1.0) if self.shape is None else self.shape)
+        if isinstance(self.shape, Form) and not self.shape.SCALES and (ends := self.sizes.ends) != (1.0, 1.0):
+            wrong = " to ".join(f"{size:g}" for size in dict.fromkeys(ends))
+            raise ValueError(f"radius of a source: {wrong}; its shape has one size, so allowed is 1, or none")
         if not self.most >= 1:
             raise ValueError(f"most grains of a source must be at least 1, got {self.most:g}")
         checks.seed("seed of a source", self.seed)
@@ -78,22 +83,24 @@ class Source(Named, Timed):
 
     def of_sizes(self, size: Floats, random: Floats) -> Bodies:
         """Grains of sizes (n,), turned by three numbers each (n, 3) from 0 to 1 if they are no spheres."""
-        count, lengths = len(size), np.array([1.0, 0.0, 0.0])
-        kind = SPHERE if self.shape is None else shapes.placed(self.shape)[0]
-        turn = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
-        if self.shape is not None:
-            lengths, turn = shapes.placed(self.shape)[3], _turns(random)
-        mass, inertia = shapes.solid(kind, size[:, None] * lengths, np.full(count, float(self.density)))
+        count, density = len(size), np.full(len(size), float(self.density))
+        if isinstance(self.shape, Form):
+            kind, (lengths, mass, inertia) = self.shape.BASE + self.number, self.shape.grown(size, density)
+        else:
+            assert self.shape is not None
+            kind, _, _, one = shapes.placed(self.shape)
+            lengths = size[:, None] * one
+            mass, inertia = shapes.solid(kind, lengths, density)
         return Bodies(
             id=np.zeros(count, np.int64),
             position=np.zeros((count, 3)),
-            quaternion=turn,
+            quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)) if kind == SPHERE else _turns(random),
             velocity=np.tile([*self.velocity, 0.0, 0.0, 0.0], (count, 1)),
             mass=mass,
             inertia=inertia,
             material=np.full(count, self.material),
             shape=np.full(count, kind),
-            size=size[:, None] * lengths,
+            size=lengths,
             weight=np.zeros(count),
         )
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 CELLS = 1000
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ClumpForm(Form):
     """The form of a `Clump`; the volume is that of the union."""
 

@@ -70,7 +70,7 @@ class Convex:
         raise NotImplementedError
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ConvexForm(Form):
     """The form of a convex shape."""
 

@@ -33,7 +33,7 @@ class Faces(NamedTuple):
     wing: Ints  #: (e, 2) the face on the left of an edge, and that on its right
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Solid(Form):
     """The form of a convex polyhedron."""
 

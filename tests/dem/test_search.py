@@ -15,9 +15,11 @@ from dem.arrays import places
 from dem.bodies import BOX, CAPSULE, COMPOUND, SPHERE
 from dem.contact import find_contacts
 from dem.contact.primitives import most_numbers, primitives
+from dem.measures import Block
 from dem.motion import Dynamic, Fixed, Glide
+from dem.parts.sources import Tally
 from dem.scene import Scene
-from dem.shapes import Box, Capsule, Plane, Sphere
+from dem.shapes import Box, Capsule, Clump, Plane, Sphere
 from dem.start import new_world
 from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
@@ -244,6 +246,20 @@ def test_keys_tell_the_contacts_of_a_million_million_grains_apart():
     key = np.concatenate([one + 1j * (last * features + features - 1) for one in last])
     np.testing.assert_array_equal(places(key, key[::-1]), np.arange(9)[::-1])
     assert places(key, key[:1] - 1j).tolist() == [-1]
+
+
+def test_the_keys_of_clumps_that_sources_let_in_are_counted():
+    scene, region = Scene(0.3), Block((0, 0, 0), (1, 1, 1))
+    clump = Clump(0.1 * np.arange(300).reshape(100, 3), np.full(100, 0.05))
+    for name, shape in {"clumps": clump, "boxes": 0.1 * np.indices((2, 2, 2)).reshape(3, -1).T}.items():
+        scene.add_source(name, region, shape=shape, density=1.0, number_rate=1.0)
+    scene.add_clumps([(0, 0, 0)], clump, 1.0)
+    world = new_world(scene, SELF)
+    assert find_contacts(world, 0.0).near.grains == 1
+    world = new_world(scene, SELF)
+    world.passages.tallies["clumps"] = Tally(count=10**12 - 1)
+    with pytest.raises(ValueError, match="their contacts have no keys"):
+        find_contacts(world, 0.0)
 
 
 @pytest.mark.parallel(2)

@@ -187,7 +187,7 @@ def slid(floor, add):
     scene.add_body("floor", [floor])
     add(scene)
     world = new_world(scene, SELF)
-    list(moved_on(world, 40))
+    list(moved_on(world, 25))
     order = np.argsort(world.grains.id)
     return world.grains.position[order], world.grains.velocity[order]
 

@@ -4,14 +4,17 @@ import numpy as np
 import pytest
 
 from dem.geometry.insertion import inserted
-from dem.measures import Block, Cylinder
+from dem.measures import Block
+from dem.measures import Cylinder as Tube
 from dem.parts.sizes import Listed, Uniform
 from dem.parts.sources import Source, Tally, bounds, numbers, points, reach
 from dem.scene import Scene
-from dem.shapes import Box, Capsule
+from dem.shapes import Box, Capsule, Clump, Cylinder, Mesh, Plane, Superellipsoid
 
 BLOCK = Block((0, 0, 0), (1, 2, 3))
-TUBE = Cylinder((1, 1, 1), (2, 3, 0), 0.5)
+TUBE = Tube((1, 1, 1), (2, 3, 0), 0.5)
+ROCK = np.array([[2, 0, 0], [-1, 0.1, 0], [0, 1.2, 0.2], [0, -1, 0], [0.1, 0, 0.8], [0, 0.2, -1]])
+CLUMP = Clump([[0, 0, 0], [1.0, 0, 0], [0, 0.4, 0]], [0.7, 0.7, 0.4])
 
 
 def source(**given):
@@ -54,6 +57,42 @@ def test_boxes_and_capsules_have_the_lengths_of_their_shape_times_the_size_and_a
     np.testing.assert_allclose(second, np.eye(4) / 4, atol=0.02)  # uniform on the sphere
     capsule = source(shape=Capsule(1.0, 2.0))
     np.testing.assert_allclose(reach(capsule.grains("a", np.arange(2))), 0.3)
+
+
+@pytest.mark.parametrize(("shape", "add", "scales"), [
+    (ROCK, Scene.add_polyhedra, True),
+    (Superellipsoid((0.3, 0.2, 0.1)), Scene.add_grains, True),
+    (Cylinder(0.1, 0.3), Scene.add_grains, True),
+    (CLUMP, Scene.add_clumps, False),
+], ids=["polyhedra", "superellipsoids", "cylinders", "clumps"])  # fmt: skip
+def test_grains_of_a_source_are_those_that_a_scene_has_at_the_start(shape, add, scales):
+    """But for their turns, which are uniform."""
+    scene = Scene(0.3)
+    scene.add_grains([(9, 9, 9)], Cylinder(0.4, 0.4), 1000.0)  # another form has the first number
+    sizes = {"radius": Uniform(0.5, 2.0)} if scales else {}
+    scene.add_source("rain", BLOCK, shape=shape, density=2000.0, mass_rate=1.0, **sizes)
+    came = scene.passages.sources["rain"].grains("rain", np.arange(3000))
+    sizes = {"scale": 0.5 + 1.5 * numbers("rain", 0, np.arange(3000), range(1))[:, 0]} if scales else {}
+    ids = add(scene, np.zeros((3000, 3)), shape, 2000.0, **sizes)
+    there = scene.grains(ids[0])
+    for name in ("shape", "size", "mass", "inertia"):
+        np.testing.assert_allclose(getattr(came, name), getattr(there, name), rtol=1e-12)
+    second = np.einsum("ni,nj->ij", came.quaternion, came.quaternion) / 3000
+    np.testing.assert_allclose(second, np.eye(4) / 4, atol=0.02)
+    assert set(scene.kinds) == set(scene.grains().shape)
+    least, most = scene.passages.sources["rain"].extremes().size
+    assert (least <= there.size.min(axis=0)).all()
+    assert (there.size.max(axis=0) <= most).all()
+
+
+def test_a_copy_of_a_scene_knows_the_shapes_of_its_sources():
+    scene = Scene(0.3)
+    for name, shape in {"clumps": CLUMP, "rocks": ROCK}.items():
+        scene.add_source(name, BLOCK, shape=shape, density=1.0, number_rate=1.0)
+    other = scene.copy()
+    for given in (scene, other):
+        assert given.kinds == [form.BASE + n for n, form in enumerate(given.forms)]
+        assert all(source.shape is given.forms[source.number] for source in given.passages.sources.values())
 
 
 def test_points_are_uniform_in_their_region():
@@ -129,7 +168,7 @@ def test_inserted_spheres_are_apart(period):
     ({"radius": Uniform(0.1, 0.2), "density": 0.0}, "density of a source must be positive"),
     ({"start": 2.0, "end": 1.0}, "Source cannot begin at 2 s and end at 1 s"),
     ({"most": 0}, "at least 1"),
-    ({"shape": "box"}, "allowed is a Box or a Capsule"),
+    ({"radius": None}, "needs a shape, or the radius of its spheres"),
     ({"seed": 1.5}, "seed of a source 1.5: allowed is a whole number from 0 on"),
     ({"seed": -1}, "seed of a source -1: allowed is"),
     ({"seed": None}, "seed of a source None: allowed is"),
@@ -137,6 +176,29 @@ def test_inserted_spheres_are_apart(period):
 def test_bad_sources_are_refused(given, words):
     with pytest.raises(ValueError, match=words):
         source(**given)
+
+
+@pytest.mark.parametrize(("given", "words"), [
+    ({"shape": "box"}, "allowed are a Sphere, Box, .* or vertices .*, got str"),
+    ({"shape": Plane((0, 0, 1))}, "shape of a source: .*, got Plane"),
+    ({"shape": Mesh.revolved([(0.0, 0.0), (1.0, 1.0)], 4)}, "shape of a source: .*, got Mesh"),
+    ({"shape": Box((1, 1, 1), center=(1, 0, 0))}, "its center and quaternion must be those of its frame"),
+    ({"shape": Cylinder(1.0, 1.0, center=(1, 0, 0))}, "its center and quaternion must be those of its frame"),
+    ({"shape": np.zeros((3, 3))}, "vertices must have shape"),
+    ({"shape": np.eye(5, 3)}, "is no corner of their hull|in a plane"),
+    ({"shape": CLUMP, "radius": 2.0}, "radius of a source: 2; its shape has one size, so allowed is 1, or none"),
+    ({"shape": CLUMP, "radius": Uniform(1.0, 2.0)}, "radius of a source: 1 to 2; its shape has one size"),
+])  # fmt: skip
+def test_what_is_no_shape_of_grains_is_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        Scene(0.3).add_source("rain", BLOCK, density=1.0, number_rate=1.0, **given)
+
+
+def test_a_misspelt_argument_is_told_with_the_nearest_one():
+    with pytest.raises(TypeError, match="add_source: there is no argument 'rate'; .*; did you mean mass_rate"):
+        Scene(0.3).add_source("rain", BLOCK, radius=0.1, density=1.0, rate=1.0)
+    with pytest.raises(ValueError, match="perod: .*; did you mean period"):
+        Scene(0.3, perod=(1, 1, 1))
 
 
 def test_bad_distributions_regions_and_names_are_refused():

@@ -43,8 +43,8 @@ def test_a_wobbling_coin_keeps_its_energy(radius, height, tilt):
     place = np.array([0, 0, radius * np.sin(tilt)]) + height / 2 * np.array([np.sin(tilt), 0, np.cos(tilt)])
     scene = on_floor("plane", 0.5)
     scene.add_grains(place, Cylinder(radius, height), 2000.0, quaternions=turn, angular_velocity=spin)
-    first, last = energies(scene, 20 * np.sqrt(radius / G))
-    assert last == pytest.approx(first, rel=0.06)
+    first, last = energies(scene, 12 * np.sqrt(radius / G))
+    assert last == pytest.approx(first, rel=0.04)
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.7])

@@ -179,9 +179,9 @@ def test_a_motor_keeps_its_speed_and_is_changed_within_the_loop():
     assert sim.joint("axle").motor.speed is None
 
 
-@pytest.mark.parametrize("dt", [0.01, 0.002])
 @pytest.mark.parametrize(
-    ("gravity", "strength", "seconds"), [(0.0, 20.0, 1.5), (0.0, 200.0, 0.5), (G, 25.0, 4.0), (G, 40.0, 1.5)]
+    ("gravity", "strength", "seconds", "dt"),
+    [(0.0, 20.0, 1.5, 0.01), (0.0, 200.0, 0.5, 0.002), (G, 25.0, 4.0, 0.01), (G, 40.0, 1.5, 0.002)],
 )
 def test_a_weak_motor_stops_at_its_target(gravity, strength, seconds, dt):
     """An arm of 1 m and 4 kg, which bears at most 19.6 N m by its weight, goes up to an angle without passing it."""
@@ -227,7 +227,7 @@ def test_a_linkage_passes_its_dead_points(start):
     scene.add_joint("C", 0, 2, anchor=length * up, axis=(0, 1, 0))
     scene.add_joint("D", 1, 2, anchor=[1, 0, 0] + length * up, axis=(0, 1, 0))
     sim, drives = pctt.Simulation(scene, dt=0.0045), []
-    while sim.time < 4.0:
+    while sim.time < 2.3:  # once round
         sim.step()
         drives.append(abs(sim.joint("A").drive))
         assert abs(sim.orientations[2][2]) < 1e-4  # the coupler stays level
@@ -253,7 +253,7 @@ def test_a_spinning_ball_on_a_joint_nods_as_deep_as_it_should(spin):
     scene.add_joint("pin", None, ball, kind="ball", anchor=(0, 0, 0))
     with pctt.Simulation(scene) as sim:
         depth = []
-        sim.run(until=0.5, call=lambda sim: depth.append(-sim.positions[0, 2] / r))
+        sim.run(until=100.0 / spin, call=lambda sim: depth.append(-sim.positions[0, 2] / r))
         assert sim.settings.dt * spin <= 0.2 + 1e-9
     x = 2 * 1.4 * r**2 * G * r / (0.4 * r**2 * spin) ** 2
     assert max(depth) == pytest.approx((np.sqrt(1 + 4 * x**2) - 1) / (2 * x), rel=2e-3)

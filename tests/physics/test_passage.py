@@ -9,7 +9,8 @@ from dem.mesh import Mesh
 from dem.motion import Fixed, Glide
 from dem.parts.sizes import Uniform
 from dem.scene import Scene
-from dem.shapes import Box, Capsule, Plane, Sphere
+from dem.shapes import Box, Capsule, Clump, Plane, Sphere, Superellipsoid
+from dem.shapes import Cylinder as Rod
 from pctt.options import OptionError
 from pctt.simulation import Simulation
 
@@ -121,6 +122,68 @@ def test_boxes_and_capsules_come_too_and_fall():
     assert len(sim.ids) == 16
     assert sim.positions[:, 2].max() < 0.06
     assert sim.positions[:, 2].min() > 0.009
+
+
+ROCK = 0.02 * np.array([[1, 0, 0], [-1, 0.1, 0], [0, 1.2, 0.2], [0, -1, 0], [0.1, 0, 0.8], [0, 0.2, -1]])
+SHAPES = {
+    "rocks": {"shape": ROCK, "radius": Uniform(0.6, 1.2)},
+    "clumps": {"shape": Clump([[-0.012, 0, 0], [0.012, 0, 0], [0, 0.016, 0]], [0.012, 0.012, 0.01])},
+    "pairs": {"shape": Clump([[-0.01, 0, 0], [0.01, 0, 0]], [0.012, 0.014])},
+    "pills": {"shape": Superellipsoid((0.02, 0.02, 0.01)), "radius": (0.8, 1.0)},
+    "rods": {"shape": Rod(0.01, 0.02)},
+    "boxes": {"shape": Box((0.02, 0.015, 0.01))},
+    "fibres": {"shape": Capsule(0.006, 0.015)},
+    "balls": {"radius": 0.012},
+}
+
+
+def silo(*names: str, high: float = 0.3, **given) -> Scene:
+    """Rain of some SHAPES between smooth walls."""
+    scene = Scene(0.5)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    inwards = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0))
+    walls = [Plane(normal, tuple(-0.08 * np.array(normal))) for normal in inwards]
+    scene.add_body("walls", walls, material="glass")
+    scene.set_pair("default", "glass", friction=0.0)
+    source = {"density": 2500.0, "number_rate": 100.0, "most": 6, **given}
+    for name in names or SHAPES:
+        scene.add_source(name, Block((-0.05, -0.05, 0.06), (0.05, 0.05, high)), **source, **SHAPES[name])
+    return scene
+
+
+@pytest.mark.parametrize("name", ["rocks", "clumps"])
+def test_a_bed_that_has_rained_comes_to_rest_on_its_floor(name):
+    sim = Simulation(silo(name, most=12), comm=MPI.COMM_SELF, tol=1e-6)
+    sim.run(until=1.0)
+    assert sim.source(name).count == len(sim.ids) == 12
+    assert sim.figures["kinetic_energy [J]"] < 1e-8 * sim.source(name).mass
+    assert -sim.body("floor").force[2] == pytest.approx(9.81 * sim.source(name).mass, rel=1e-4)
+    assert sim.positions[:, 2].min() > 0.0
+    assert np.abs(sim.positions[:, :2]).max() < 0.08
+    assert sim.positions[:, 2].max() < 0.1
+
+
+def test_grains_of_all_shapes_come_at_their_rates_without_overlaps_and_their_contacts_have_keys_of_their_own():
+    scene = silo(mass_rate=1.0, number_rate=None, most=4)
+    scene.add_clumps([(0, 0, 0.03)], Clump([[0, 0, 0.01], [0, 0, -0.01]], [0.02, 0.02]), 2500.0)
+    sim = Simulation(scene, comm=MPI.COMM_SELF, **WORDS)
+    came, largest = 1, 0
+    while sim.time < 0.25:
+        sim.step()
+        new = np.isin(sim.last.contacts.near.bodies.id, sim.ids[came:])
+        contacts, came = sim.last.contacts, len(sim.ids)
+        touching = new[contacts.a] | new[contacts.b]
+        assert contacts.gap[touching].min(initial=0.0) >= 0.0
+        assert len(np.unique(contacts.key)) == len(contacts.key)
+        largest = max(largest, len(contacts.key))
+        for name in SHAPES:
+            tally, heaviest = sim.source(name), scene.passages.sources[name].extremes().mass.max()
+            due = sim.time - WORDS["dt"] - tally.mass
+            assert tally.refused or tally.count == 4 or -1e-9 <= due < heaviest
+    assert came == 1 + 4 * len(SHAPES)
+    assert largest > 60
+    assert held(sim)[1] == pytest.approx(
+        scene.survey().mass + sum(sim.source(name).mass for name in SHAPES), rel=1e-12)  # fmt: skip
 
 
 def test_a_run_that_begins_and_ends_without_grains():
@@ -260,6 +323,39 @@ def test_a_source_that_was_set_goes_on_after_a_restart(tmp_path):
     sim.change("source rain", number_rate=0.0)
     sim.run(steps=20)
     assert sim.source("rain").count <= count + 1
+
+
+@pytest.mark.parallel(3)
+def test_the_same_grains_of_all_shapes_come_on_any_number_of_ranks():
+    """Up to their first contacts to rounding."""
+    scene = silo(high=0.6, number_rate=300.0)
+    together, alone = (Simulation(scene, comm=comm, **WORDS) for comm in (MPI.COMM_WORLD, MPI.COMM_SELF))
+    for _ in range(10):
+        together.step()
+        alone.step()
+    one, other = ({**state(sim), "shape": sim._of_grains("shape")} for sim in (together, alone))
+    assert len(one["ids"]) > 20
+    assert len(np.unique(one["shape"])) == len(SHAPES)
+    for name in ("ids", "shape", "size", "mass"):
+        np.testing.assert_array_equal(one[name], other[name])
+    np.testing.assert_allclose(one["position"], other["position"], atol=1e-5)
+
+
+@pytest.mark.parallel(1, 2)
+def test_a_restart_with_grains_of_all_shapes_goes_on_with_the_same_bits(tmp_path):
+    comm = MPI.COMM_WORLD
+    sim = Simulation(silo(high=0.6), comm=comm, **WORDS)
+    sim.run(steps=20)
+    sim.change("source clumps", number_rate=900.0)
+    sim.save(tmp_path / "state.h5")
+    again = Simulation.load(tmp_path / "state.h5", silo(high=0.6), comm=comm, **WORDS)
+    for each in (sim, again):
+        each.run(steps=12)
+    one, other = ({**state(each), "shape": each._of_grains("shape")} for each in (sim, again))
+    for name, column in one.items():
+        np.testing.assert_array_equal(column, other[name])
+    assert sim.source("clumps").count == again.source("clumps").count == 6
+    assert len(np.unique(one["shape"])) == len(SHAPES)
 
 
 @pytest.mark.slow
