@@ -92,6 +92,13 @@ def vector(name: str, values: ArrayLike) -> Floats:
     return rows(name, values, 1, 3)[0]
 
 
+def seed(name: str, value: Any) -> int:
+    """Return a whole number from 0 on, of which random numbers are made."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
+        raise ValueError(f"{name} {value!r}: allowed is a whole number from 0 on")
+    return int(value)
+
+
 def counts(name: str, values: ArrayLike) -> Ints:
     """Return three whole numbers above zero."""
     array = vector(name, values)

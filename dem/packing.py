@@ -37,7 +37,7 @@ def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -
 def uniform(low: float, high: float, shape: tuple[int, ...], seed: int) -> Rule:
     """Return the array of this shape that `default_rng(seed).uniform` gives, of which any rows are made without the
     others: of the generator PCG64 every number takes one step, and it can jump (`advance`)."""
-    width = math.prod(shape[1:])
+    width, seed = math.prod(shape[1:]), checks.seed("seed", seed)
 
     def make(first: int, end: int) -> Floats:
         generator = np.random.Generator(np.random.PCG64(seed).advance(first * width))
@@ -70,7 +70,7 @@ def random_packing(
     sizes = sizes_of(radius)
     if 2.0 * sizes.ends[1] * (2.0 if any(periodic) else 1.0) > box.min():
         raise ValueError(f"spheres of radius {sizes.ends[1]:g} m do not fit into a box with a side of {box.min():g} m")
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(checks.seed("seed of a packing", seed))
     wanted = fraction * box.prod()
     radii = sizes.at(random.random(int(np.ceil(1.2 * wanted / (4 / 3 * np.pi * sizes.ends[0] ** 3))) + 1))
     radii = radii[: 1 + int(np.searchsorted(np.cumsum(4 / 3 * np.pi * radii**3), wanted * (1.0 - 1e-12)))]

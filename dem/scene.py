@@ -522,9 +522,9 @@ class Scene:
 
         A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,), or the axes
         that the kind has, are in the world at time zero, where angle and position are zero; they are those of `other`
-        relative to `one`. A motor keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a torque or force
-        of at most `strength` [N m, N]; inf: as much as it takes. `limits` (2,): least and greatest angle [rad] or
-        position [m]. The two bodies go through each other, unless they are `touching`.
+        relative to `one`. A motor keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a `speed` at that
+        at most, with a torque or force of at most `strength` [N m, N]; inf: as much as it takes. `limits` (2,): least
+        and greatest angle [rad] or position [m]. The two bodies go through each other, unless they are `touching`.
         """
         if not name or name in self.named["joint"]:
             raise ValueError(f"joints need distinct names, got {name!r}")

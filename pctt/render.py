@@ -111,7 +111,9 @@ class Picture:
         return file.getvalue()
 
     def save(self, path: str | Path) -> None:
-        """Write a PNG file, whole or not at all; FileError if that fails."""
+        """Write a PNG file, whole or not at all; FileError if that fails. OptionError for another suffix."""
+        if Path(path).suffix.lower() != ".png":
+            raise OptionError(f"save({str(path)!r}): allowed is a name that ends with .png")
         with whole(Path(path)) as temporary:
             temporary.write_bytes(self._repr_png_())
 

@@ -41,12 +41,14 @@ from dem.parts.springs import Spring
 from dem.record.energies import energy
 from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.start import step_remark
-from dem.start.time_step import fall_remark, reason
-from dem.start.tools import SwingWatch
+from dem.start.doubts import doubts
+from dem.start.time_step import fall_remark, reason, smallest
+from dem.start.tools import PaceWatch, SwingWatch
 from dem.start.turns import TurnWatch
 from dem.step import Step
 from dem.step.impulses import ImpulseMemory
 from dem.together import barrier, together
+from dem.unconstrained.loose import LooseWatch
 from pctt import ccp, log
 from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
@@ -133,9 +135,10 @@ class Simulation:
         falls = "" if restart else comm.bcast(fall_remark(scene, self.settings.dt))
         if large := step_remark(self.world, self.settings.dt) or falls:
             warn(comm, large)
-        if doubts := "" if restart else comm.bcast(scene.doubts()):
-            warn(comm, doubts)
-        self._watches = TurnWatch(), SwingWatch()
+        if likely := "" if restart else comm.bcast(doubts(scene)):
+            warn(comm, likely)
+        half = smallest(scene)
+        self._watches = TurnWatch(), SwingWatch(), PaceWatch(half, scene.leaving), LooseWatch(half)
         self._tell_turns()
         self._begun = restart
         self.restart = "" if isinstance(restart, state.RunState) else str(restart)  #: the file from which it goes on
@@ -143,6 +146,8 @@ class Simulation:
         self.stepper = Stepper(self.settings, self.world, self.memory, newton)
         watch = OverlapWatch(scene, self.settings, float(self.world.pairs.stiffness.min()))
         self.overlap_watch = comm.bcast(watch)  # processors may round in other ways
+        if soft := self.overlap_watch.soft(program):
+            warn(comm, soft)
         self._program, self._jumped, self._unsolved = program, False, program
         self.last: Step | None = None
         self.figures: dict[str, Any] = {}
@@ -251,7 +256,7 @@ class Simulation:
             warn(self.comm, report.unsolved_words(self.figures))
 
     def _tell_turns(self) -> None:
-        """Warn of a body that turns or swings too far in a step; collective."""
+        """Warn of a body that goes, turns or swings too far in a step, or of a joint that does not hold; collective."""
         for watch in self._watches:
             if words := watch.look(self.world, self.settings.dt):
                 warn(self.comm, words)

@@ -14,6 +14,7 @@ import pytest
 
 import pctt
 from pctt import Box, Dynamic, Plane, Scene, Simulation
+from pctt.options import OptionError
 from pctt.render import Picture
 
 
@@ -48,4 +49,7 @@ def test_objects_say_what_they_are_in_a_line():
     sim = Simulation(scene)
     assert repr(sim.body("arm")) == "<Body 'arm': Dynamic, at (3, 0, 1.5) m, 0 m/s>"
     assert repr(sim.joint("pin")) == "<Joint 'pin': hinge of the world and 'arm'>"
-    assert repr(Picture(np.zeros((480, 640, 3), np.uint8))).startswith("<Picture of 640 x 480 pixels")
+    picture = Picture(np.zeros((480, 640, 3), np.uint8))
+    assert repr(picture).startswith("<Picture of 640 x 480 pixels")
+    with pytest.raises(OptionError, match=r"save\('now.jpg'\): allowed is a name that ends with .png"):
+        picture.save("now.jpg")  # it would be a PNG file

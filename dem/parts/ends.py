@@ -10,6 +10,7 @@ import numpy as np
 
 from dem import checks
 from dem.arrays import Floats, Ints
+from dem.motion import Dynamic
 from dem.parts.named import Named
 from dem.quaternion import cross
 
@@ -79,6 +80,16 @@ class Condition(NamedTuple):
 class Constraint(Tie):
     """A part whose impulses follow from what it asks of relative velocities of its bodies, together with those of all
     contacts; see `dem.unconstrained.constraints`."""
+
+    def refuse(self, name: str, world: Any) -> None:
+        """ValueError for a constraint of bodies that no force moves: it would hold nothing."""
+        super().refuse(name, world)
+        motion = {body.name: body.motion for body in world.large_bodies}
+        if not any(isinstance(end, int) or isinstance(motion.get(end), Dynamic) for end in self.ends):
+            kind = type(self).__name__.lower()
+            ends = " and ".join("the world" if end is None else repr(end) for end in self.ends)
+            what = f"{kind} {name!r}: the motions of {ends} are prescribed, so it holds nothing"
+            raise ValueError(f"{what}; allowed is one body at least that forces move, by Dynamic() say")
 
     @classmethod
     def geometry(cls, members: Sequence[Any], row: Ints, cell: Cell) -> Place:

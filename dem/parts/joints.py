@@ -77,8 +77,8 @@ class Joint(Constraint):
 
     kind: str
     frames: Sequence[Sequence[float]]  #: (2, 4) quaternions, of which the z axis is that of the joint
-    speed: float | None = None  #: that a motor keeps [rad/s] or [m/s]
-    #: angle [rad] or position [m] to which a motor goes, as fast as its strength lets it go and stop there
+    speed: float | None = None  #: that a motor keeps, or with a target the greatest [rad/s] or [m/s]
+    #: angle [rad] or position [m] to which a motor goes, as fast as speed and strength let it go and stop there
     target: float | None = None
     strength: float = np.inf  #: the greatest torque [N m] or force [N] of the motor
     low: float = -np.inf  #: least angle [rad] or position [m]
@@ -91,11 +91,11 @@ class Joint(Constraint):
         if self.kind not in KINDS:
             raise ValueError(f"kind of a joint {self.kind!r}: allowed are {', '.join(KINDS)}")
         super().__post_init__()
-        if self.speed is not None and self.target is not None:
-            raise ValueError("the motor of a joint: allowed is a speed or a target, not both")
         for name in ("speed", "target"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, float(checks.finite(f"{name} of a motor", getattr(self, name))))
+        if self.target is not None and self.speed is not None and self.speed <= 0.0:
+            raise ValueError(f"speed of a motor with a target, {self.speed:g}: allowed is the greatest, above zero")
         checks.positive_or_inf("strength of a motor", self.strength)
         if not self.low <= self.high:
             raise ValueError(f"limits of a joint: the lower one, {self.low:g}, is above the upper one, {self.high:g}")
@@ -106,7 +106,7 @@ class Joint(Constraint):
                     f"{name} of a hinge, {angle:g} rad: allowed are angles from -pi to pi; a motor with a speed, and "
                     "without limits, turns further"
                 )
-        if not KINDS[self.kind].motor and (self.driven or np.isfinite([self.low, self.high]).any()):
+        if not KINDS[self.kind].motor and (self.driven or np.isfinite([self.strength, self.low, self.high]).any()):
             raise ValueError(f"a {self.kind} joint has no motor and no limits: allowed are those of hinges and sliders")
 
     def refuse(self, name: str, world: Any) -> None:
@@ -170,10 +170,11 @@ class Joint(Constraint):
         return KINDS[self.kind].coordinate
 
     def changed(self, time: float, tally: Any, **values: Any) -> Joint:
-        """As of `Named`; with a `speed` there is no `target`, and the other way round."""
+        """As of `Named`; a `speed` alone ends a target, and a `target` alone a speed that was kept. A greatest speed
+        stays when another target comes."""
         if values.get("speed") is not None:
             values.setdefault("target", None)
-        if values.get("target") is not None:
+        elif values.get("target") is not None and self.target is None:
             values.setdefault("speed", None)
         return dataclasses.replace(self, **values)
 
@@ -183,7 +184,8 @@ class Joint(Constraint):
         found = [Condition(coordinate, HELD, -error[coordinate] / dt) for coordinate in holds]
         if self.driven:
             way = np.inf if self.target is None else min(max(self.target, self.low), self.high) - at
-            speed = self.speed if self.target is None else way / dt
+            most = np.inf if self.speed is None else self.speed
+            speed = most if self.target is None else min(max(way / dt, -most), most)
             speed = min(max(speed, (self.low - at) / dt), (self.high - at) / dt)  # it stops at its limits
             found.append(Condition(self.coordinate, MOTOR, speed, self.strength * dt, way))
         limits = (LOWER, self.low), (UPPER, self.high)

@@ -45,7 +45,7 @@ def fall(scene: Scene, acceleration: Floats, start: float = 0.0) -> Fall:
     if size == 0.0:
         return NONE
     along, grains, every = acceleration / size, scene.survey(), scene.expected()
-    planes, levels = _ends(scene, along)
+    planes, levels = ends(scene, along)
     if not len(planes) and not len(levels):
         return NONE
     halves = bodies.least_half_thickness(every)
@@ -66,7 +66,7 @@ def fall(scene: Scene, acceleration: Floats, start: float = 0.0) -> Fall:
 
 def free_path(scene: Scene, body: LargeBody, along: Floats) -> float:
     """How far a large body may go along a direction (3,) before it meets another one, at most; 0 without an end [m]."""
-    planes, levels = _ends(scene, along, besides=body)
+    planes, levels = ends(scene, along, besides=body)
     corners = [_corners(-extent, extent) + place for place, extent in (box(body, shape) for shape in body.shapes)
                if np.isfinite(extent).all()]  # fmt: skip
     if not corners or not (len(planes) or len(levels)):
@@ -136,7 +136,7 @@ def _shortest_path(place: Floats, along: Floats, planes: Floats, levels: Floats)
     return float(ahead.min(initial=np.inf)) if np.isfinite(ahead).any() else 0.0
 
 
-def _ends(scene: Scene, along: Floats, besides: LargeBody | None = None) -> tuple[Floats, Floats]:
+def ends(scene: Scene, along: Floats, besides: LargeBody | None = None) -> tuple[Floats, Floats]:
     """What ends a way along a direction (3,): half spaces (p, 2, 3), a point and the normal of each; and of other
     parts of bodies the last place (l,) of a surface that faces the way, along it [m]."""
     planes, levels = [], []

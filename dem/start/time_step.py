@@ -16,14 +16,13 @@ from dem.arrays import Floats
 from dem.contact.primitives import extents
 from dem.parts.named import Pressing
 from dem.scene import LargeBody, Scene
-from dem.shapes import Plane, outline
+from dem.shapes import Plane
 from dem.start.falls import fall
 from dem.start.pressing import pressing
-from dem.start.tools import greatest_speed, swing, top_speed
+from dem.start.tools import DRIVEN, greatest_speed, hull, swing, top_speed
 from dem.start.toppling import toppling
 from dem.start.turns import TURN, held_beside, turning_of_grains, turning_of_large
 
-DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/choose.md has the errors of forces
 FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
 FALLS = 1.5  #: the way in a step, in radii, of a grain that has fallen; two are the limit of `dem.step.fast`
 PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same and steps take a quarter longer
@@ -140,11 +139,11 @@ def _fall(scene: Scene) -> float:
 def _top_speed(body: LargeBody, about: bool, step: float) -> float:
     """The greatest speed of a point of a large body [m/s], or of the ball `about` its place; a plane has no end, and
     counts by the body's centre. `step` [s]: as of `dem.start.tools.top_speed`."""
-    shapes = tuple(shape for shape in body.shapes if not isinstance(shape, Plane))
-    parts = [(np.zeros((1, 3)), extents([shapes]) if shapes else np.zeros(1))]
-    if shapes and not about:
-        parts = [outline(shape) for shape in shapes]
-    point, radius = (np.concatenate(column) for column in zip(*parts))
+    if about:
+        shapes = tuple(shape for shape in body.shapes if not isinstance(shape, Plane))
+        point, radius = np.zeros((1, 3)), extents([shapes]) if shapes else np.zeros(1)
+    else:
+        point, radius = hull(body)
     point = body.position + quaternion.rotate(body.quaternion, point)
     start = greatest_speed(body.velocity, body.position, point, radius)
     return max(start, top_speed(body, point, radius, step))

@@ -7,6 +7,8 @@ stops, are no swing: of each RUN changes after each other the median counts.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +16,7 @@ import numpy as np
 from dem import quaternion
 from dem.arrays import Floats
 from dem.motion import KINDS, Glide, Guided, Held, Hinged, Oscillation, Path, Rotation, velocity_between
+from dem.shapes import Plane, outline
 from dem.start.turns import SLACK, TURN
 
 if TYPE_CHECKING:
@@ -24,6 +27,8 @@ SAMPLES = 1000  #: poses of a motion of one's own that are looked at, from time 
 FINE = 0.25  #: between them, in steps in which grains come to rest
 ROUNDED = 1e-10  #: of their places [m] and of a radian, that poses may be off without being moved
 RUN = 5  #: changes of velocity
+DRIVEN = 0.2  #: the way of the fastest tool in a step, in radii: docs/choose.md has the errors of forces
+PACE = 2.0  #: radii in a step above which it is told: a tool passes a grain
 WINDOW = 20  #: steps of a run whose velocities are looked at together; a tool that swings in two of them is told
 
 
@@ -112,6 +117,51 @@ def _frequency(lasts: Floats, velocity: Floats) -> Floats:
     mean: Floats = np.sqrt(np.divide(squares, square, out=np.zeros(square.shape), where=square > 0.0))
     half = 0.5 * float(lasts.mean())
     return np.arcsin(np.minimum(half * mean, 1.0)) / half
+
+
+def hull(body: LargeBody) -> tuple[Floats, Floats]:
+    """Points (n, 3) in the frame of a body, and radii (n,) of balls about them, that hold its shapes [m]. A plane has
+    no end: a body of planes alone is its origin."""
+    parts = [outline(shape) for shape in body.shapes if not isinstance(shape, Plane)]
+    point, radius = zip(*parts or [(np.zeros((1, 3)), np.zeros(1))])
+    return np.concatenate(point), np.concatenate(radius)
+
+
+class PaceWatch:
+    """Tells once of a large body that goes too far in a step, as of a motion that a run has changed: by more than PACE
+    times a `half` thickness of the grains [m], and is none of those that are `leaving` them."""
+
+    def __init__(self, half: float, leaving: Collection[str]) -> None:
+        self._half, self._leaving, self._steps, self._told = half, leaving, 0, False
+        self._hulls: dict[str, tuple[Floats, Floats]] = {}
+
+    def look(self, world: World, dt: float) -> str:
+        """What to say of a dt [s], most often nothing: after the first step, and each WINDOW; collective."""
+        self._steps += 1
+        if self._told or self._steps % WINDOW != 2:  # the first is at time zero, before motions
+            return ""
+        fastest = {body.name: self._speed(world, row) for row, body in enumerate(world.large_bodies)
+                   if body.name not in self._leaving}  # fmt: skip
+        name, speed = world.comm.bcast(max(fastest.items(), key=itemgetter(1), default=("", 0.0)))
+        if dt * speed <= PACE * self._half:
+            return ""
+        self._told = True
+        return (
+            f"dt {dt:g} s is too large: {name} goes with {speed:.3g} m/s, by {dt * speed / self._half:.2g} half "
+            f"thicknesses of the grains in a step; take at most {DRIVEN * self._half / speed:.2g} s"
+        )
+
+    def _speed(self, world: World, row: int) -> float:
+        """The greatest speed [m/s] of a large body."""
+        body, velocity = world.large_bodies[row], world.large.velocity[row]
+        if not velocity.any():
+            return 0.0
+        if body.name not in self._hulls:
+            self._hulls[body.name] = hull(body)
+        point, radius = self._hulls[body.name]
+        arm = quaternion.rotate(world.large.quaternion[row], point)
+        along = np.linalg.norm(velocity[:3] + np.cross(velocity[3:], arm), axis=1)
+        return float((along + np.linalg.norm(velocity[3:]) * radius).max())
 
 
 class SwingWatch:

@@ -8,12 +8,14 @@ import numpy as np
 
 from dem.scene import Scene, least_half
 from dem.start.stiffness import expected_overlap
-from dem.start.time_step import DRIVEN, smallest
+from dem.start.time_step import smallest
+from dem.start.tools import DRIVEN
 from dem.step import Step
 from dem.step.overlaps import overlaps
 from pctt.run.report import remedy
 from pctt.run.settings import CLOSING, Settings
 
+SOFT = 0.5  #: parts of a half thickness, beyond which bodies are no longer rigid at all
 TWICE = 2.0  #: overlaps are told of that are so many times what is promised
 
 #: What makes overlaps, by the field of `Settings` that helps.
@@ -43,6 +45,13 @@ class OverlapWatch:
         self._worst = self._held = self._loose = 0.0
         self._start: float | None = None  #: the overlap with which the run starts, which it does not make
         self._told: set[str] = set()
+
+    def soft(self, program: bool) -> str:
+        """What is said before the first step if contacts are too soft for what they bear; empty if they are not."""
+        if self.elastic <= SOFT:
+            return ""
+        words = "contacts are so soft that weight, tools and falls press bodies into each other by up to"
+        return f"{words} {self.elastic:.3g} half thicknesses. What helps: {remedy('stiffness', program)} [N/m]"
 
     def look(self, step: Step, closing_speed: float) -> str:
         """The field of `Settings` that helps, if a step shows more than TWICE of what is promised and it was not told

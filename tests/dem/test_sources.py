@@ -169,7 +169,9 @@ def test_inserted_spheres_are_apart(period):
     ({"start": 2.0, "end": 1.0}, "Source cannot begin at 2 s and end at 1 s"),
     ({"most": 0}, "at least 1"),
     ({"radius": None}, "needs a shape, or the radius of its spheres"),
-    ({"seed": 1.5}, "seed of a source must be a whole number, got 1.5"),
+    ({"seed": 1.5}, "seed of a source 1.5: allowed is a whole number from 0 on"),
+    ({"seed": -1}, "seed of a source -1: allowed is"),
+    ({"seed": None}, "seed of a source None: allowed is"),
 ])  # fmt: skip
 def test_bad_sources_are_refused(given, words):
     with pytest.raises(ValueError, match=words):

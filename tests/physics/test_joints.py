@@ -1,5 +1,7 @@
 """Joints: closed forms of mechanisms, contacts through joints, restarts, ranks."""
 
+import warnings
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -7,7 +9,7 @@ from scipy.special import ellipk
 
 import pctt
 from dem.measures import Block
-from dem.motion import Dynamic, Glide
+from dem.motion import Dynamic, Glide, Held
 from dem.scene import Scene
 from dem.shapes import Box, Plane
 from pctt import ccp
@@ -532,13 +534,14 @@ def test_a_body_that_is_squeezed_against_its_joint_has_no_solution():
     ("given", "words"),
     [
         ({"kind": "rope"}, "kind of a joint"),
-        ({"speed": 1.0, "target": 1.0}, "not both"),
+        ({"speed": -1.0, "target": 1.0}, "speed of a motor with a target, -1: allowed is the greatest, above zero"),
         ({"kind": "ball", "speed": 1.0}, "no motor"),
         ({"limits": (1.0, 0.0)}, "limits"),
         ({"strength": -1.0}, "strength"),
         ({"target": 4.0}, "target of a hinge, 4 rad: allowed are angles from -pi to pi"),
         ({"limits": (-1.0, 3.2)}, "high of a hinge, 3.2 rad"),
         ({"limits": (-4.0, 1.0), "speed": 1.0}, "low of a hinge, -4 rad"),
+        ({"kind": "ball", "strength": 5.0}, "a ball joint has no motor and no limits"),
         ({"limits": (0.5, 1.0)}, "limits of 'axle', 0.5 to 1: allowed are those about 0, where it is at time zero"),
     ],
 )
@@ -599,6 +602,59 @@ def test_a_flap_swings_as_ever_while_grains_come_and_go_elsewhere():
     assert sim.outlet("drain").count > 0
     assert abs(angles[0]) > 0.5
     assert angles[1] == pytest.approx(angles[0], abs=1e-9)
+
+
+def test_a_joint_of_bodies_that_no_force_moves_is_refused():
+    """It would hold nothing, and its motor would turn nothing."""
+    scene = Scene(friction=0.3)
+    scene.add_spheres([5, 0, 0], 0.05, 1000.0)
+    scene.add_body("sled", [Box((0.1, 0.1, 0.1))], Glide((1, 0, 0)))
+    scene.add_joint("pin", None, "sled", anchor=(0, 0, 0), axis=(0, 1, 0), target=1.0)
+    words = "joint 'pin': the motions of the world and 'sled' are prescribed, so it holds nothing; allowed is one body"
+    with pytest.raises(OptionError, match=words):
+        simulation(scene)
+
+
+@pytest.mark.parametrize("strength", [np.inf, 100.0])
+def test_a_motor_goes_to_its_target_at_its_greatest_speed(strength):
+    """Another target keeps that speed; a speed alone is kept, and a target alone after it has none."""
+    sim = simulation(wheel(target=0.5, speed=2.0, strength=strength), dt=0.01)
+    axle = sim.joint("axle")
+    sim.run(until=0.2)
+    assert (axle.speed, axle.angle) == pytest.approx((2.0, 0.4), rel=2e-2)
+    sim.run(until=0.5)
+    assert (axle.speed, axle.angle) == pytest.approx((0.0, 0.5), abs=1e-6)
+    sim.change("joint axle", target=-0.5)
+    sim.run(steps=20)
+    assert (axle.speed, axle.angle) == pytest.approx((-2.0, 0.1), rel=2e-2)
+    sim.change("joint axle", speed=4.0, target=-0.5)
+    sim.run(steps=10)
+    assert axle.speed == pytest.approx(-4.0, rel=2e-2)
+    sim.change("joint axle", speed=-1.0)
+    assert axle.motor.target is None
+    sim.change("joint axle", target=0.0)
+    assert axle.motor.speed is None
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize(("motion", "words"), [
+    (Held((0.5, 0, None), (0, 0, 0)), "joint 'pin' does not hold, its sides are 0.045 m apart: its bodies are held"),
+    (Held((0, 0, None), (0, 1.9, 0)), "joint 'pin' does not hold, its sides are 0.17 rad apart"),
+    (Held((None, 0, None), (0, 0, 0)), ""),
+])  # fmt: skip
+def test_a_joint_that_cannot_hold_is_told_once(motion, words):
+    """No force of a joint moves what a motion holds; it is looked at after nine steps."""
+    scene = Scene(friction=0.3)
+    scene.add_spheres([5, 0, 0], 0.09, 1000.0)
+    scene.add_body("axle", [Box((0.1, 0.1, 0.1))], motion, mass=1.0)
+    scene.add_joint("pin", None, "axle", kind="fixed", anchor=(0, 0, 0))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", UserWarning)
+        sim = pctt.Simulation(scene, dt=0.01, delta=0.01, comm=MPI.COMM_WORLD)
+        sim.run(steps=20)
+    found = [str(each.message) for each in told if "does not hold" in str(each.message)]
+    assert len(found) == bool(words and sim.comm.rank == 0)
+    assert all(each.startswith(words) for each in found)
 
 
 def test_a_joint_of_a_grain_is_refused_beside_an_outlet():

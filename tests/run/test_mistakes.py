@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 
 import pctt
-from pctt import Box, Dynamic, Fixed, Plane, Scene, Simulation, measures
+from pctt import Box, Dynamic, Fixed, Glide, Mesh, Plane, Rotation, Scene, Simulation, measures
 from pctt.disk import FileError
 from pctt.options import OptionError
 from pctt.scenes import Mixer
@@ -95,6 +95,93 @@ def test_unused_materials_and_rolling_of_more_than_a_radius_are_told():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Simulation(scene)
+
+
+def bare(friction=0.5, density=1500.0, **law):
+    scene = Scene(friction, **law)
+    scene.add_spheres([0, 0, 0.3], 0.05, density)
+    return scene
+
+
+def floored(**given):
+    scene = bare(**given)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    return scene
+
+
+def poured():
+    scene = floored()
+    region = measures.Block((0, 0, 1), (1, 1, 2))
+    scene.add_source("rain", region, radius=0.05, density=2.5, number_rate=1.0)
+    return scene
+
+
+def walled():
+    scene = bare()
+    scene.add_body("walls", [Plane((1, 0, 0), (-1, 0, 0)), Plane((0, -1, 0), (0, 1, 0))])
+    return scene
+
+
+def in_millimetres():
+    scene = floored()
+    scene.add_body("wheel", [Mesh.revolved([(0, 0), (100, 0), (100, 50)], 8)], Rotation((0, 0, 1)), position=(0, 0, 99))
+    return scene
+
+
+def hung():
+    scene = bare()
+    scene.add_spring("rope", None, 0, stiffness=10.0)
+    return scene
+
+
+def drained():
+    scene = bare()
+    scene.add_outlet("below", measures.Block((-1, -1, -2), (1, 1, -1)))
+    return scene
+
+
+@pytest.mark.parametrize(("scene", "words"), [
+    (floored(density=2.5), "a density of 2.5 kg/m.3: is it in g/cm.3"),
+    (poured(), "a density of 2.5 kg/m.3: is it in g/cm.3"),
+    (floored(friction=30.0), "friction 30: is it an angle in degrees"),
+    (floored(static_friction=26.6), "friction 26.6: is it an angle in degrees"),
+    (in_millimetres(), "the mesh of 'wheel' is 200 m long: is it in mm, scale=1e-3"),
+    (bare(), "the grains fall for ever, as no part of a large body is below them: a floor is"),
+    (walled(), "the grains fall for ever"),
+    (floored(stiffness=1.0), "contacts are so soft that .* half thicknesses. What helps: a larger stiffness="),
+    (floored(), ""), (floored(friction=1e6), ""), (hung(), ""), (drained(), ""), (bare(gravity=(0, 0, 0)), ""),
+])  # fmt: skip
+def test_what_is_likely_a_mistake_is_told_before_the_first_step(scene, words):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", UserWarning)
+        Simulation(scene)
+    found = [str(each.message) for each in told if each.category is UserWarning]
+    assert len(found) == bool(words), found
+    assert all(re.match(words, each) for each in found), found
+
+
+@pytest.mark.parallel(1, 2)
+@pytest.mark.parametrize(("motion", "told"), [
+    (Glide((5.1, 0, 0)), True), (Glide((4.9, 0, 0)), False),
+    (Rotation((0, 0, 20.0)), True), (Rotation((0, 0, 8.0)), False),
+])  # fmt: skip
+@pytest.mark.parametrize("changed", [False, True])
+def test_a_tool_that_passes_a_grain_in_a_step_is_told_once(motion, told, changed):
+    """Grains have radii of 5 cm, of which it goes two in 20 ms with 5 m/s; its corner is 0.354 m from the axis."""
+    scene = falling()
+    still = type(motion)((0, 0, 0))
+    scene.add_body("blade", [Box((0.25, 0.25, 0.01))], still if changed else motion, position=(0, 0, 9))
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always", UserWarning)
+        sim = Simulation(scene, dt=0.02)
+        if changed:
+            sim.run(steps=2)
+            sim.change("body blade", motion=motion)
+        sim.run(steps=45)
+    found = [str(each.message) for each in seen if "blade goes with" in str(each.message)]
+    assert len(found) == (told and MPI.COMM_WORLD.rank == 0)
+    words = r"dt 0.02 s is too large: blade goes with (5.1|7.07) m/s, by 2.* half thicknesses of the grains in a step"
+    assert all(re.match(words, each) for each in found)
 
 
 def test_a_scene_that_a_simulation_has_stays_as_it_is():

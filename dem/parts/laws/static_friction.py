@@ -17,6 +17,7 @@ from dem import checks
 from dem.arrays import Floats
 from dem.parts.laws import ContactState, Law, Solved, coefficient
 
+STEEP = 5.0  #: coefficients above are none of materials, and up to 90 they may be angles
 RESTS = 0.01  #: solvers leave a slip of that order: so slides only what friction would not stop in this part of a step
 ROUNDING = 1e-12  #: a new contact is at rest below this slip [m/s]
 
@@ -36,6 +37,11 @@ class StaticFriction(Law):
                 f"static_friction must be 0, or at least the friction of {np.max(self.friction):g}, "
                 f"got {np.asarray(self.static_friction)[low].min():g}"
             )
+
+    def doubt(self, radius: float) -> str:
+        most = max(self.friction, self.static_friction)
+        words = f"friction {most:g}: is it an angle in degrees, of which the tangent is the coefficient?"
+        return words if STEEP < most <= 90.0 else ""
 
     def acts(self) -> bool:
         return bool(np.any(self.static_friction))
