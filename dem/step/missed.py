@@ -234,6 +234,7 @@ def _joined(world: World, one: Contacts, other: Contacts) -> Contacts:
         one, other = (x if x.parting is not None else replace(x, parting=np.full(len(x), np.nan)) for x in (one, other))
     if (one.swing is None) != (other.swing is None):
         one, other = (x if x.swing is not None else replace(x, swing=np.zeros_like(x.point)) for x in (one, other))
+    one, other = replace(one, touched=None), replace(other, touched=None)  # impacts were followed before
     more = other.columns()
     both = {name: np.concatenate([column, more[name]]) for name, column in one.columns().items()}
     order = contact_order(world, one.near, both["a"], both["b"], both["key"])
