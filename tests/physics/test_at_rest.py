@@ -82,7 +82,7 @@ def at_rest(scene, seconds, begin, **settings):
         (tower(*[1000.0] * 16), 36),
         (tower(1000.0, 3e5), 36),
         (tower(1000.0, 3e6), 60),
-        (tower(1000.0, 0.3), 36),
+        (tower(1e5, 30.0), 36),
         (tower(1000.0, 1000.0, 1000.0, 4e4), 36),
         (overhang(0.93), 36),
     ],
