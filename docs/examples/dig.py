@@ -65,7 +65,7 @@ def plot(folder: str) -> None:
 if __name__ == "__main__":
     folder = sys.argv[1]
     with Simulation(digging(), dt=0.005, delta=0.002) as sim:
-        print(f"a bucket digs in {len(sim.positions)} spheres; the first step compiles loops, once", flush=True)
+        print(f"a bucket digs in {len(sim.positions)} spheres", flush=True)
         sim.write(folder, overwrite=True, every=8, checkpoint_every=100)
         sim.run(until=2.6, progress=True)
         print(f"{len(sim.contacts)} contacts in the last step, solved to {sim.figures['coulomb_residual']:.1e}")

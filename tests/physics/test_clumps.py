@@ -92,7 +92,7 @@ def pile(count, clearance=1.02):
 def test_a_pile_of_200_comes_to_rest():
     """Stopped at 3 m/s overlaps are what the stiffness allows; at rest they are those of the weight."""
     with pctt.Simulation(pile(200), dt=2e-3) as sim:
-        sim.run(until=2.0)
+        sim.run(until=3.0)  # some roll off late
         radius = sim.world.grains.size[:, 0].min()
         assert np.abs(sim.velocities[:, :3]).max() < 0.02
         assert sim.contacts.gap.min() > -0.006 * radius
