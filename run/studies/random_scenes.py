@@ -367,12 +367,12 @@ def simulated(seed: int, steps: int) -> Row:
             lines.extend(sim.step() for _ in range(steps))
         except Exception as error:  # whatever it is, it is a note
             notes.append(end_of(made, fastest(sim), error))
-        still = float(sim.local.mass.sum()) * (1e-9 * made.radius / sim.settings.dt) ** 2
+        mass, slow = float(sim.local.mass.sum()), 1e-9 * made.radius / sim.settings.dt
         notes += [*solves(made, lines), *overlaps(made, sim, lines), *places(made, sim)]
-        notes += energies(lines, bool(made.fed), still)
+        notes += energies(lines, bool(made.fed), mass * slow**2)
         if not (made.fed or made.held):
             now = momentum(sim)
-            change = np.abs(now[0] - before[0]).max() / max(now[1], before[1], 1e-300)
+            change = np.abs(now[0] - before[0]).max() / max(now[1], before[1], mass * slow)
             notes += [Note(f"the momentum of free bodies changes by {change:.1e} of itself")] * bool(change > 1e-9)
         grains = len(sim.positions)
     its = [line["iterations"] for line in lines] or [0]
