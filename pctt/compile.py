@@ -31,7 +31,7 @@ from pctt import (
     Simulation,
     Superellipsoid,
 )
-from pctt.scenes import Mixer
+from pctt.scenes import Mixer, PlaneShear
 
 CORNERS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])  # of a tetrahedron
 FACES = [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]
@@ -92,9 +92,7 @@ def parts() -> None:
     scene.add_joint("arm", "lid", anchor=(0, 0, 0.941))
     scene.add_spring("spring", 0, stiffness=100.0)
     run(scene)
-    cell = Scene(friction=0.5, gravity=(0, 0, 0), period=(0.5, 0.5, 0.5), shear_rate=1.0, stress=(None, 1e3, None))
-    cell.add_spheres(places(0.103, 0.306), 0.1, DENSITY)
-    run(cell)
+    run(PlaneShear(n=6))
 
 
 def shapes() -> None:
