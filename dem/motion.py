@@ -55,6 +55,10 @@ class Dynamic:
         """The mean velocity (6,) from `time` to `time + dt` [s] of what neither forces nor torques can change."""
         return np.zeros(6)
 
+    def top_velocity(self) -> Floats:
+        """The greatest velocity (6,) that a drive or what holds the body asks for."""
+        return np.zeros(6)
+
 
 class Driven(Dynamic, Timed):
     """Moved by forces along one line of the world only, or by torques about one only, with a drive that acts on it.
@@ -81,6 +85,11 @@ class Driven(Dynamic, Timed):
     def line(self) -> Floats:
         """Unit vector (3,) of the line."""
         return np.array(getattr(self, self._line))
+
+    def top_velocity(self) -> Floats:
+        """As of `Dynamic`."""
+        along: Floats = (self.speed or 0.0) * np.concatenate([self.free_directions(), self.free_turns()]) @ self.line
+        return along
 
     def strength(self, time: float, dt: float) -> float:
         """The greatest mean force or torque from `time` to `time + dt` [s]."""
@@ -189,10 +198,13 @@ class Held(Dynamic, Timed):
         """Projector (3, 3) on the axes about which the angular velocity is free."""
         return np.diag([float(value is None) for value in self.angular_velocity])
 
+    def top_velocity(self) -> Floats:
+        """As of `Dynamic`."""
+        return np.array([value or 0.0 for value in (*self.velocity, *self.angular_velocity)])
+
     def held(self, time: float, dt: float) -> Floats:
         """The velocity (6,) that is held, its mean from `time` to `time + dt` [s]; zero where it is free."""
-        values = np.array([value or 0.0 for value in (*self.velocity, *self.angular_velocity)])
-        return (self.elapsed(time + dt) - self.elapsed(time)) / dt * values
+        return (self.elapsed(time + dt) - self.elapsed(time)) / dt * self.top_velocity()
 
 
 @dataclass(frozen=True)
@@ -202,6 +214,10 @@ class Fixed:
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """Position (3,) and quaternion (4,) at `time` [s] of a body with the given ones at time zero."""
         return position, orientation
+
+    def top_velocity(self) -> Floats:
+        """The greatest velocity (6,) of the body; turns are about `center` if the motion has one."""
+        return np.zeros(6)
 
 
 @dataclass(frozen=True)
@@ -224,6 +240,10 @@ class Rotation(Timed):
         center = np.array(self.center)
         turned = quaternion.normalized(quaternion.multiply(turn, orientation))
         return center + quaternion.rotate(turn, position - center), turned
+
+    def top_velocity(self) -> Floats:
+        """As of `Fixed`."""
+        return np.array([0.0, 0.0, 0.0, *self.velocity])
 
 
 @dataclass(frozen=True)
@@ -248,6 +268,15 @@ class Oscillation(Timed):
         swing = np.sin(angle + self.phase) - np.sin(self.phase)
         return position + self.amplitude * swing * np.array(self.direction), orientation
 
+    @property
+    def angular_frequency(self) -> float:
+        """[rad/s]; 0 without an amplitude."""
+        return 2.0 * np.pi / self.period if self.amplitude else 0.0
+
+    def top_velocity(self) -> Floats:
+        """As of `Fixed`."""
+        return np.array([*(self.amplitude * self.angular_frequency * np.array(self.direction)), 0.0, 0.0, 0.0])
+
 
 @dataclass(frozen=True)
 class Glide(Timed):
@@ -264,6 +293,10 @@ class Glide(Timed):
     def pose(self, time: float, position: Floats, orientation: Floats) -> tuple[Floats, Floats]:
         """As of `Fixed`."""
         return position + self.elapsed(time) * np.array(self.velocity), orientation
+
+    def top_velocity(self) -> Floats:
+        """As of `Fixed`."""
+        return np.array([*self.velocity, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -313,6 +346,20 @@ class Path:
         places = np.array(self.positions)
         place = np.array([np.interp(time, self.times, axis) for axis in places.T])
         return position + place - places[0], orientation
+
+    @property
+    def lasts(self) -> Floats:
+        """How long the body goes from each place to the next (n - 1,) [s]."""
+        return np.diff(self.times)
+
+    @property
+    def velocities(self) -> Floats:
+        """The velocities (n - 1, 3) from each place to the next."""
+        return np.diff(np.array(self.positions), axis=0) / self.lasts[:, None]
+
+    def top_velocity(self) -> Floats:
+        """As of `Fixed`."""
+        return np.array([*max(self.velocities, key=np.linalg.norm, default=np.zeros(3)), 0.0, 0.0, 0.0])
 
 
 #: Motions that do not answer to forces.

@@ -15,7 +15,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
-from dem.motion import KINDS, Glide, Guided, Held, Hinged, Oscillation, Path, Rotation, velocity_between
+from dem.motion import KINDS, Oscillation, Path, velocity_between
 from dem.shapes import Plane, outline
 from dem.start.turns import SLACK, TURN
 
@@ -35,30 +35,13 @@ WINDOW = 20  #: steps of a run whose velocities are looked at together; a tool t
 def top_speed(body: LargeBody, point: Floats, radius: Floats, step: float) -> float:
     """The greatest speed [m/s] that its motion or servo gives to what is within `radius` (n,) [m] of `point` (n, 3) [m]
     at time zero, of a large body. Motions of one's own are looked at in every FINE part of a `step` [s]."""
-    motion, still, along, about, center = body.motion, np.zeros(3), np.zeros(3), np.zeros(3), body.position
-    if _is_own(body):
-        _, velocity = _sampled(body, step)
-        turning = np.linalg.norm(velocity[:, 3:], axis=1)
-        spin = velocity[turning.argmax(), 3:]  # about an axis that goes with the body
-        return float(np.linalg.norm(velocity[:, :3], axis=1).max()) + greatest_speed(
-            np.concatenate([still, spin]), center, point, radius
-        )
-    if isinstance(motion, Rotation):
-        about, center = np.array(motion.velocity), np.array(motion.center)
-    elif isinstance(motion, Oscillation):
-        along = 2.0 * np.pi * motion.amplitude / motion.period * np.array(motion.direction)
-    elif isinstance(motion, Glide):
-        along = np.array(motion.velocity)
-    elif isinstance(motion, Path):
-        speeds = np.diff(np.array(motion.positions), axis=0) / np.diff(motion.times)[:, None]
-        along = max(speeds, key=np.linalg.norm, default=still)
-    elif isinstance(motion, Held):
-        along, about = np.array([value or 0.0 for value in (*motion.velocity, *motion.angular_velocity)]).reshape(2, 3)
-    elif isinstance(motion, Hinged):
-        about = (motion.speed or 0.0) * motion.line
-    elif isinstance(motion, Guided):
-        along = (motion.speed or 0.0) * motion.line
-    return greatest_speed(np.concatenate([along, about]), center, point, radius)
+    if not _is_own(body):
+        center = np.array(getattr(body.motion, "center", body.position))
+        return greatest_speed(body.motion.top_velocity(), center, point, radius)
+    _, velocity = _sampled(body, step)
+    spin = velocity[np.linalg.norm(velocity[:, 3:], axis=1).argmax(), 3:]  # about an axis that goes with the body
+    turning = greatest_speed(np.concatenate([np.zeros(3), spin]), body.position, point, radius)
+    return float(np.linalg.norm(velocity[:, :3], axis=1).max()) + turning
 
 
 def greatest_speed(velocity: Floats, center: Floats, point: Floats, radius: Floats) -> float:
@@ -71,16 +54,12 @@ def greatest_speed(velocity: Floats, center: Floats, point: Floats, radius: Floa
 def swing(body: LargeBody, step: float) -> float:
     """The angular frequency [rad/s] with which the motion of a large body swings; 0 of those that do not. Motions of
     one's own are looked at in every FINE part of a `step` [s]."""
-    motion = body.motion
-    if isinstance(motion, Oscillation) and not _is_own(body):
-        return 2.0 * np.pi / motion.period if motion.amplitude else 0.0
-    if isinstance(motion, Path) and not _is_own(body):
-        lasts = np.diff(motion.times)
-        return float(_frequency(lasts, np.diff(np.array(motion.positions), axis=0) / lasts[:, None]))
-    if not _is_own(body):
-        return 0.0
-    lasts, velocity = _sampled(body, step)
-    return float(max(_frequency(lasts, velocity[:, :3]), _frequency(lasts, velocity[:, 3:])))
+    if _is_own(body):
+        lasts, velocity = _sampled(body, step)
+        return float(max(_frequency(lasts, velocity[:, :3]), _frequency(lasts, velocity[:, 3:])))
+    if isinstance(body.motion, Path):
+        return float(_frequency(body.motion.lasts, body.motion.velocities))
+    return float(getattr(body.motion, "angular_frequency", 0.0))
 
 
 def _is_own(body: LargeBody) -> bool:

@@ -72,9 +72,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     ball[grains:] = False
     if kinds_of(Constraint, world.named):
         ball[slots(world, table.id)[0]] = False
-    image = np.zeros((len(contacts), 3))
-    if world.cell.periodic:
-        image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
+    image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     radius = np.ascontiguousarray(table.size[:, 0])
     surface, slow = np.zeros((0, 3)), np.full(len(contacts), dt * math.hypot(*world.gravity))
     if pairs.bounces:
@@ -151,8 +149,7 @@ def _where_they_touch(
     changed = (contacts.point, contacts.normal, contacts.moved, contacts.linear_gap)
     point, normal, moved, linear = (column.copy() for column in changed)
     normal[rows], point[rows] = n, table.position[a] + radius[a, None] * n
-    to_image = world.cell.whole(moved[rows]) if world.cell.periodic else 0.0
-    moved[rows] = to_image + time[:, None] * (velocity[b, :3] - velocity[a, :3])
+    moved[rows] = world.cell.whole(moved[rows]) + time[:, None] * (velocity[b, :3] - velocity[a, :3])
     found = replace(contacts, point=point, normal=normal, moved=moved)
     comes = _surfaces(found.take(rows), velocity) - velocity[a, :3]
     linear[rows] = -time * np.einsum("ci,ci->c", n, comes)
