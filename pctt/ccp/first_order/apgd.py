@@ -14,8 +14,9 @@ the fixed point of the projected step, and one run finds it. But that step is no
 derivative of any function of the impulses. Linearised, the step is an unsymmetric map with complex eigenvalues a + ib,
 and where 1 - beta < |b| / sqrt(a) momentum beta turns them into growing oscillations. So momentum begins anew where
 steps have grown, and has a bound. A quadratic function of curvatures from k to L needs 1 - beta of about sqrt(k / L).
-Here k is the least curvature of the ways that the impulses have gone: from zero to the guess, and from look to look. It
-is small in deep beds, whose forces go by few contacts of many bodies, and a hundred times as large in flows.
+Here k is the least curvature of the ways that the impulses have gone from look to look. It is small in deep beds, whose
+forces go by few contacts of many bodies, and a hundred times as large in flows. A guess of the last step has the forces
+of the bed already: that the way to it from zero is flat says nothing about what is left.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class APGD(FirstOrder):
     step's length."""
 
     check: int = number(25, "most iterations between two looks at the natural residual")
-    lipschitz: float = number(2.0, "the first L: A has a diagonal of about one, and on packings L is 2 to 3")
+    lipschitz: float = number(2.5, "the first L: A has a diagonal of about one, and on packings L is 2 to 3")
     margin: float = number(1.3, "L of a repeated step, over the curvature found: the next need not be repeated too")
     decay: float = number(0.99, "factor on L after each step, so that steps grow again where the curvature allows it")
     theta: float = number(0.2, "where momentum begins: below 1, as steps are short for most directions of descent")
@@ -85,7 +86,7 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     y = gradient
     lipschitz, whole = options.lipschitz, True
     theta, beta, step, least = options.theta, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, its least since beta = 0
-    most, flattest, before = 1.0, np.inf, (np.zeros_like(now.x), scaled.b)  # of beta; curvature; at the last look
+    most, flattest, before = 1.0, np.inf, (now.x.copy(), scaled.b)  # of beta; curvature; at the last look
     while True:
         if progress.is_due(math.sqrt(step)):
             (now, last, new), y = scaled.restore(now, last, new), gradient
