@@ -165,13 +165,16 @@ class Stepper:
         """The contacts, whose lists and table of bodies take the place of those of both worlds: these take memory, any
         lists that hold lead to the same contacts, and the first bodies of the table are the grains as they are."""
         near, given, grains = contacts.near, self.world.grains, world.grains
-        for name in (*CONSTANT, *MOVING):
+        new = contacts.lists is not self.world.lists
+        for name in (*CONSTANT, *MOVING) if new else MOVING:
             column = getattr(near.bodies, name)[: near.grains]
             if getattr(given, name) is getattr(grains, name):
                 setattr(given, name, column)
             setattr(grains, name, column)
-        self.world.lists = world.lists = contacts.lists.of(world)
-        return replace(contacts, lists=world.lists)
+        if new:
+            contacts = replace(contacts, lists=contacts.lists.of(world))
+        self.world.lists = world.lists = contacts.lists
+        return contacts
 
     def _recalled(self, world: World, contacts: Contacts) -> tuple[Array, Array]:
         """The impulses (parts nc, 3) of the last step of these contacts, and what laws kept of them (nc, columns)."""
