@@ -7,6 +7,7 @@ the methods better puts the new numbers into the table.
 from __future__ import annotations
 
 import sys
+import tracemalloc
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,7 +19,7 @@ from petsc4py import PETSc
 from problems import SELF, Known, from_graph, heap, random_graph
 from train_solver import context, poisson, ready, solve
 
-import pctt
+import pctt.simulation  # now: loops that are made while `steps` counts calls would not work later
 from dem.compiled import Loop
 from dem.contact_map import ContactMap
 from dem.scene import Scene
@@ -101,6 +102,7 @@ MOST = {  # the sums, as counted
         },
     },
     "flows": {"a sheared cell": {"iterations": 1881}},
+    "memory": {"a bed": {"bytes of a grain": 3282}},
     "calls": {
         "ten boxes": {"functions of Python": 75371}, "a pendulum": {"functions of Python": 81677},
         "ten balls at rest": {"functions of Python": 46554},
@@ -339,10 +341,27 @@ def calls(patch: pytest.MonkeyPatch) -> Counter[str]:
     return counts
 
 
+def memory(patch: pytest.MonkeyPatch) -> Counter[str]:
+    """The most that steps of a bed of spheres hold at once, with all that there is of its state."""
+    scene, side = Scene(friction=0.4), 10
+    place = 0.1 + 0.2002 * np.indices((side, side, side)).reshape(3, -1).T
+    scene.add_spheres(place + np.random.default_rng(0).uniform(-5e-4, 5e-4, place.shape), 0.1, 1000.0)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    with pctt.Simulation(scene, dt=0.005, say=lambda _: None) as sim:
+        sim.copy().run(steps=3)  # so that loops are compiled
+        tracemalloc.start()  # of numpy's arrays and of those of compiled loops
+        try:
+            sim.copy().run(steps=3)
+            most = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+    return Counter({"a bed: bytes of a grain": most // side**3})
+
+
 WALLS = [((1, 0, 0), (0, 0, 0)), ((-1, 0, 0), (0.84, 0, 0)), ((0, 1, 0), (0, 0, 0)), ((0, -1, 0), (0, 0.84, 0))]
 
 
-GROUPS = (methods, systems, trains, preconditioners, flows, steps, calls)
+GROUPS = (methods, systems, trains, preconditioners, flows, steps, calls, memory)
 
 
 @pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)

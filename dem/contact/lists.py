@@ -65,6 +65,10 @@ class Lists:
         strained = world.cell.strained_since(self.cell)
         return stays(then, self.near.margin, size, world.grains.position, margin, *strained)
 
+    def of(self, world: World) -> Lists:
+        """The same lists for a world that has taken their columns that no step changes."""
+        return replace(self, constant=_constant(world))
+
 
 def grain_lists(world: World, last: Lists | None, margin: Floats, travel: Floats) -> Lists:
     """The lists of an earlier search if they hold for the margins (grains,) [m], else new ones for grains that go the
@@ -96,7 +100,9 @@ def _constant(world: World) -> list[Any]:
     return [*_COLUMNS(world.grains), *_COLUMNS(world.large), *(body.shapes for body in world.large_bodies)]
 
 
-_COLUMNS = attrgetter("id", "mass", "inertia", "material", "shape", "size")
+#: Columns of bodies that no step changes.
+CONSTANT = "id", "mass", "inertia", "material", "shape", "size"
+_COLUMNS = attrgetter(*CONSTANT)
 
 
 @loop

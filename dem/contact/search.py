@@ -93,8 +93,10 @@ class Contacts:
 
     @cached_property
     def frame(self) -> Floats:
-        """The `contact_frames` (nc, 3, 3) of the normals."""
-        return contact_frames(self.normal)
+        """The `contact_frames` (nc, 3, 3) of the normals, which from then on are their first rows."""
+        frame = contact_frames(np.ascontiguousarray(self.normal))
+        vars(self)["normal"] = frame[:, 0]  # so that they take no memory beside the frames
+        return frame
 
     def branch(self, position: Floats) -> Floats:
         """From the centre of body a to that of body b, or of its image (nc, 3), at these positions (rows, 3) [m]."""

@@ -56,7 +56,6 @@ class ContactMap:
         self.rows, self.columns, self.couples = given.rows, given.columns + self.mass.more, self.mass.couples
         self.log_flops: Callable[[float], None] = lambda count: None  #: told how many operations a product took
         self._arrays = self._floats(given.frame), self._floats(given.arm), body
-        self._w, self._m = np.zeros((2, halo.rows, 6), precision)
         self._pushed = np.zeros(self.mass.axes)  # by the impulses that were collected last, on this rank
         self._first_away = self.rows
         if len(halo.ghosts):
@@ -65,6 +64,16 @@ class ContactMap:
             self._first_away = first_touching(body, ghost)
         self._set_parts()
         self._flops = 45 * self.rows + 6 * self.columns
+
+    @cached_property
+    def _w(self) -> Floats:
+        """Memory for the velocities of bodies, which a map takes with its first product."""
+        return np.zeros((self.halo.rows, 6), self.precision)
+
+    @cached_property
+    def _m(self) -> Floats:
+        """The same for their momenta."""
+        return np.zeros((self.halo.rows, 6), self.precision)
 
     def with_mass(self, mass: InverseMass) -> ContactMap:
         """The same rows between bodies of another inverse mass."""
@@ -312,8 +321,9 @@ class ContactMap:
     def contact_blocks(self) -> Floats:
         """The diagonal blocks of G G' (nc, 3, 3)."""
         out = np.empty((self.rows, 3, 3), self.precision)
-        mass = np.zeros((self.halo.rows, self.mass.square.shape[1]), self.precision)
-        mass[: self.halo.own] = self.mass.square
+        square = self.mass.square
+        mass = np.zeros((self.halo.rows, square.shape[1]), self.precision)
+        mass[: self.halo.own] = square
         self.halo.update(mass)
         loops.contact_blocks(*self._arrays, mass, self.mass.mobility, out)
         return out
@@ -342,6 +352,8 @@ class ContactMap:
         rows = CompactRows(frame, given.arm, given.body, given.root, given.columns)
         other = ContactMap(self.comm, rows, self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
+        if precision is self.precision:
+            other._w, other._m = self._w, self._m
         if threads() > 1:
             other._ends = self._ends
         return other
@@ -378,7 +390,8 @@ class ContactMap:
         blocks = np.take_along_axis(blocks, order[:, :, None, None], axis=1)[moves]
         both = root_blocks(root)[local[moves]]
         blocks = np.concatenate([blocks[:, :, :3] @ both[:, 0], blocks[:, :, 3:] @ both[:, 1]], axis=2)
-        return BlockRows(np.concatenate([[0], np.cumsum(moves.sum(axis=1))]), body[moves], blocks, given.columns)
+        start = np.concatenate([[0], np.cumsum(moves.sum(axis=1))])
+        return BlockRows(start, body[moves].astype(np.int64), blocks, given.columns)
 
     def _floats(self, array: Floats) -> Floats:
         return np.ascontiguousarray(array, dtype=self.precision)

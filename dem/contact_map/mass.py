@@ -8,6 +8,7 @@ and a small matrix of s. An image of impulses (see `dem.contact_map.ContactMap`)
 from __future__ import annotations
 
 import copy
+from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -33,20 +34,31 @@ class InverseMass:
     axes = 0  #: along which a cell changes its size: 3, or 0
 
     def __init__(self, root: Floats, precision: type[np.floating] = np.float64):
-        self.precision = precision
-        self.root = np.ascontiguousarray(root, dtype=precision)
-        self.square = np.ascontiguousarray(loops.squared(root), dtype=precision)
-        self.unshared = self.square  #: M^-1 of the bodies that are in no shared coordinate, else zero
+        self.precision, self._roots = precision, root
         self.none = np.zeros(0, precision)  #: the rates of no cell
+
+    @cached_property
+    def root(self) -> Floats:
+        """R."""
+        return np.ascontiguousarray(self._roots, dtype=self.precision)
+
+    @property
+    def square(self) -> Floats:
+        """M^-1, a new array."""
+        return loops.squared(self._roots).astype(self.precision, copy=False)
+
+    @cached_property
+    def unshared(self) -> Floats:
+        """M^-1 of the bodies that are in no shared coordinate, else zero."""
+        return self.square
 
     def rounded(self: Mass, precision: type[np.floating]) -> Mass:
         """The same in this precision."""
         if precision is self.precision:
             return self
         other = copy.copy(self)
-        other.root, other.square = (np.ascontiguousarray(x, dtype=precision) for x in (self.root, self.square))
-        alone = self.unshared is self.square
-        other.unshared = other.square if alone else np.ascontiguousarray(self.unshared, dtype=precision)
+        for name in ("root", "unshared"):
+            other.__dict__.pop(name, None)
         other.precision, other.none = precision, np.zeros(0, precision)
         return other
 
@@ -110,9 +122,13 @@ class ConstrainedMass(InverseMass):
         super().__init__(root, precision)
         self.comm, self.here, self.slot, self.coupling = comm, here, slot, coupling
         self.shared = len(coupling) // 6
-        self.unshared = self.square.copy()
-        self.unshared[here] = 0.0
         self._given = root[here]
+
+    @cached_property
+    def unshared(self) -> Floats:
+        out = self.square
+        out[self.here] = 0.0
+        return out
 
     def uncoupled(self, z: Floats) -> Floats:
         """(I - K) z for z (shared, 6) of all constrained bodies."""

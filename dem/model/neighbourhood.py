@@ -20,6 +20,9 @@ from dem.exchange import exchange
 if TYPE_CHECKING:
     from dem.model.world import World
 
+#: Columns of bodies that steps change, and their parts of a message.
+MOVING = {"position": slice(3), "quaternion": slice(3, 7), "velocity": slice(7, 13)}
+
 
 @dataclass(frozen=True)
 class Neighbourhood:
@@ -75,7 +78,7 @@ def refreshed(near: Neighbourhood, halo: Halo, world: World, margin: Floats) -> 
         ghosts = moved[grains:]
     columns = {
         name: np.concatenate([getattr(world.grains, name), ghosts[:, part], getattr(world.large, name)])
-        for name, part in (("position", slice(3)), ("quaternion", slice(3, 7)), ("velocity", slice(7, 13)))
+        for name, part in MOVING.items()
     }
     table = Bodies(**(vars(near.bodies) | columns))
     return Neighbourhood(table, np.concatenate([margin, ghosts[:, 13]]), near.index, grains, near.ghosts)

@@ -119,19 +119,19 @@ def of_youngs_modulus(modulus: ArrayLike, radius: ArrayLike) -> float:
 def gap_velocities(
     stiffness: Floats, material: Ints, mass: Floats, a: Ints, b: Ints, gap: Floats, dt: float, recovery_speed: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Stiffness (nc,), compliance (nc, 2) of normals and tangents, and the part of r (nc,) that closes gaps or pushes
+    """Stiffness (nc,), compliance (nc, 3) of normals and tangents, and the part of r (nc,) that closes gaps or pushes
     overlaps apart: gap / dt, of stiff contacts that overlap the share of `compliance`, of rigid ones at most the
     recovery speed.
 
     `stiffness` (materials, materials); `material` and `mass` of the bodies, which have the rows a, b (nc,)."""
-    k, C, speed = np.empty(len(gap)), np.empty((len(gap), 2)), np.empty(len(gap))
+    k, C, speed = np.empty(len(gap)), np.empty((len(gap), 3)), np.empty(len(gap))
     last, one, two, normal, tangent, share = -1.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for c in range(len(gap)):
         k[c] = stiffness[material[a[c]], material[b[c]]]
         if k[c] != last or mass[a[c]] != one or mass[b[c]] != two:  # many contacts are those of like bodies
             last, one, two = k[c], mass[a[c]], mass[b[c]]
             normal, tangent, share = compliance(last, 1.0 / (1.0 / one + 1.0 / two), dt)
-        C[c, 0], C[c, 1] = normal, tangent
+        C[c, 0], C[c, 1], C[c, 2] = normal, tangent, tangent
         speed[c] = gap[c] / dt
         if speed[c] < 0.0:
             speed[c] *= share

@@ -61,7 +61,7 @@ class ContactSystem:
         friction (nc,), mu (nc,): friction coefficient, and that of the cones: zero in impacts that are `smooth`
         frame (nc, 3, 3): rows normal (from a to b), t1, t2
         stiffness (nc,): of the contacts; inf: rigid [N/m]
-        compliance (nc, 2): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
+        compliance (nc, 3): C, the relative velocity that an impulse along the normal, or a tangent, leaves for its
         spring; 0: rigid [1/kg]
         last (nc,), held (nc, 2): the normal impulses of the last step, and what tangential springs hold at the start of
         this one [N s]
@@ -106,7 +106,7 @@ class ContactSystem:
         self.drives, self.applied = motion.drives, motion.applied
         self.key, self.point, self.frame = contacts.key, contacts.point, contacts.frame
         last = np.zeros((len(contacts), 3)) if last is None else last[: len(contacts)]
-        self.last, self.held = np.ascontiguousarray(last[:, 0]), last[:, 1:]
+        self.last, self.held = last[:, 0], last[:, 1:]
         self.contact_map = _map_of(world, contacts, self.frame, self.drives)
         self.surface = surface_velocities(world, contacts, self.frame)
         self.take_flow(world, contacts)
@@ -158,7 +158,7 @@ class ContactSystem:
         if self.resistance is not None:
             self.resistance.velocity[:] += change[len(freely) :]
         if self.landing is not None:
-            b += self.landing.before * self.compliance[:, [0, 1, 1]]
+            b += self.landing.before * self.compliance
 
     def _linearised(
         self, world: World, motion: UnconstrainedMotion, last: Floats
@@ -550,7 +550,7 @@ def _beyond(b, freely, rounding, frame, swing, impacts, compliance, held):
 def _rows_of(a, b, index, mass, owned, point, moved, position):
     """Of contacts of bodies in the rows a and b (nc,): the rows (nc, 2), the `index` (nc, 2) of those that move, else
     -1, which rows that this rank does not own they touch and move, and the arms of `contact_arms`."""
-    row, moving = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int64)
+    row, moving = np.empty((len(a), 2), np.uint32), np.empty((len(a), 2), np.int32)
     touched, arm = np.zeros(len(mass), np.bool_), np.empty((len(a), 6))
     for c in range(len(a)):
         row[c, 0], row[c, 1] = a[c], b[c]

@@ -178,7 +178,7 @@ def _wrong_contacts(
         ("mu", friction, [(nc,), (nc, 2)][: width - 1]),
         ("point", point, [(nc, 3)]),
         ("key", key, [(nc,)]),
-        ("compliance", soft, [(), (nc,), (nc, 2)]),
+        ("compliance", soft, [(), (nc,), (nc, 2), (nc, 3)]),
     ):
         if given is not None and (found := _shape(given)) not in allowed:
             words = " or ".join(map(str, allowed))
@@ -190,7 +190,7 @@ def _wrong_contacts(
             more = f" and {len(wrong) - 1} more numbers" if len(wrong) > 1 else ""
             kind = "finite numbers" + " >= 0" * (least == 0.0)
             return f"{name} is {numbers.ravel()[wrong[0]]} at contact {wrong[0] // per}{more}; allowed are {kind}"
-    if friction.ndim == 2 and soft.ndim == 2 and soft[:, 1].any():
+    if friction.ndim == 2 and soft.ndim == 2 and soft[:, 1:].any():
         return "compliance of tangents, with friction per direction; allowed with it is compliance of normals"
     if isinstance(G, (BlockRows, CompactRows, ContactMap)):
         if G.rows != parts * nc:

@@ -73,8 +73,8 @@ class ConeProblem:
     contact_map : the operator if it is G, and the bodies are known; or None
     point : (nc, 3) contact points (m) or None; orders the unknowns of hierarchical preconditioners
     key : (nc,) persistent names of the contacts or None
-    compliance : (nc, 3) the diagonal of C, (C_n, C_t, C_t) per contact (1/kg); given as C_n, a number or (nc,), or as
-        (nc, 2)
+    compliance : (nc, 3) the diagonal of C, (C_n, C_t, C_t) per contact (1/kg); given as C_n, a number or (nc,), as
+        (nc, 2), or whole: then it is that array
     yields, all_yield : whether C is not zero, and whether no contact is rigid along its normal, the same on all ranks
     size : contacts on all ranks, Nc
     unanswered : contacts on all ranks that no impulse moves: N has zeros in their rows
@@ -153,7 +153,7 @@ class ConeProblem:
         return ConeProblem(
             self.comm, self.r[rows], cones=self.cones.only(contacts), G=self.contact_map.part(contacts),
             point=None if self.point is None else self.point[contacts],
-            key=None if self.key is None else self.key[contacts], compliance=self.compliance[contacts, :2],
+            key=None if self.key is None else self.key[contacts], compliance=self.compliance[contacts],
         )  # fmt: skip
 
     # -- the user's units ------------------------------------------------------------------------------------
@@ -378,18 +378,15 @@ class ConeProblem:
 def compliances(compliance: Array | float, contacts: int, rows: int) -> Array:
     """The diagonal of C (rows, 3), of so many contacts in the first rows, from what a `ConeProblem` takes as the
     compliance."""
-    out, given = np.zeros((rows, 3)), np.asarray(compliance, dtype=float)
+    given = np.asarray(compliance, dtype=float)
+    if given.shape == (rows, 3):
+        return np.ascontiguousarray(given)
+    out = np.zeros((rows, 3))
     if given.ndim == 2:
-        _put_both_tangents(np.ascontiguousarray(given), out)
+        out[:contacts] = given[:, [0, 1, -1]]
     else:
         out[:contacts, 0] = given
     return out
-
-
-@loop
-def _put_both_tangents(given: Array, out: Array) -> None:
-    for c in range(len(given)):
-        out[c, 0], out[c, 1], out[c, 2] = given[c, 0], given[c, 1], given[c, 1]
 
 
 @loop

@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +14,10 @@ from mpi4py import MPI
 
 from dem.arrays import Ints
 from dem.contact import Contacts, find_contacts
+from dem.contact.lists import CONSTANT
 from dem.exchange import reduced
 from dem.model.images import wrap
+from dem.model.neighbourhood import MOVING
 from dem.model.partition import rebalance
 from dem.model.world import World
 from dem.record.passage import insert_and_remove
@@ -107,7 +109,9 @@ class Stepper:
 
     def _next_step(self, world: World) -> NewStep:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
-        given, found, result, eased, smooth, turned, shown = self.settings, None, None, None, False, 0, 0
+        given, result, eased, smooth, turned, shown = self.settings, None, None, False, 0, 0
+        found: ImpulseMemory | None = None  # what contacts of this step had, before there were others
+        guess: Array | None = None
         with log.phase("search"):
             insert_and_remove(world)  # grains that leave, and those that are due
             wrap(world)  # into the periodic cell
@@ -119,7 +123,9 @@ class Stepper:
                 last, kept = self._recalled(world, contacts)
                 system = ContactSystem(world, contacts, free, given.recovery_speed, last, eased, smooth, kept)
                 free = system.motion  # with the joints
-                guess = last if found is None else found.recall(system.key, system.frame, elsewhere=False)[0]
+                if found is not None:
+                    guess, found = found.recall(system.key, system.frame, elsewhere=False)[0], None
+                guess = last if guess is None else guess
                 problem = cone_problem(system, world.comm)
             with problem:
                 result = self._solved(world, system, problem, guess, result)
@@ -140,9 +146,9 @@ class Stepper:
                 if missed is other is less is None:
                     files = self._dumped(system, problem, guess, result)
                     break
-            found, result = _remembered(world, system, result), result.cost
+            found, guess, result = _remembered(world, system, result), None, result.cost
             free, eased = other or free, less or eased
-            del system, problem, guess, last, kept, velocity  # before others take as much memory
+            del system, problem, last, kept, velocity  # before others take as much memory
             if missed is not None:
                 del contacts
                 with log.phase("search"):
@@ -156,8 +162,17 @@ class Stepper:
         return NewStep(step, self._figures(world, problem.size, result, files), held, kept)
 
     def _with_lists(self, world: World, contacts: Contacts) -> Contacts:
-        """The contacts, whose lists take the place of those of both worlds: these take memory, and any that hold lead
-        to the same contacts."""
+        """The contacts, whose lists and table of bodies take the place of those of both worlds: these take memory, any
+        lists that hold lead to the same contacts, and the first bodies of the table are the grains as they are."""
+        near, given, grains = contacts.near, self.world.grains, world.grains
+        new = contacts.lists is not self.world.lists
+        for name in (*CONSTANT, *MOVING) if new else MOVING:
+            column = getattr(near.bodies, name)[: near.grains]
+            if getattr(given, name) is getattr(grains, name):
+                setattr(given, name, column)
+            setattr(grains, name, column)
+        if new:
+            contacts = replace(contacts, lists=contacts.lists.of(world))
         self.world.lists = world.lists = contacts.lists
         return contacts
 

@@ -96,7 +96,7 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
             whole = True
             if coulomb:
                 flattest = min(flattest, scaled.curvature(now.x, slope, *before))
-                before = now.x.copy(), slope.copy()
+                before = progress.looked, slope
                 most = 1 - min(max(math.sqrt(FLAT * flattest / lipschitz), options.near), options.damping)
         scaled.rigid_gradient(now, last, beta, y)  # at z = x + beta (x - last_x)
         if whole and step > 0:

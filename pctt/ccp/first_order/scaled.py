@@ -125,7 +125,9 @@ class ScaledProblem:
     def look(self, now: Iterate, y: Array) -> Array:
         """A x + b (nc, 3) where all contacts are active, and ``y`` its rigid part."""
         self.rigid_gradient(now, now, 0.0, y)
-        return y + self._compliance * now.x if self.problem.yields else y
+        slope: Array = self._compliance * now.x
+        slope += y
+        return slope
 
     def restore(self, now: Iterate, last: Iterate, new: Iterate) -> list[Iterate]:
         """The iterates with all contacts, of which the last is memory for a new one."""
@@ -284,6 +286,7 @@ class Progress:
         self.history: list[float] = before.history if before else []
         self.status, self.reason = Status.STALLED, ""
         self.best, self._point = np.inf, np.zeros((0, 3))  # residual and x
+        self.looked = self._point  # the last x that was looked at
         self._looks = self._next_look = 0
         self._size, self._last_look = 0.0, (1.0, 0.0)  # of the last step; the residual and the size at the last look
         self._suspicious, self._unbounded = limits.tol, ""
@@ -315,8 +318,9 @@ class Progress:
         residual = self._residual(x, gradient)
         self.history.append(residual)
         self.limits.report(self.iterations, residual)
+        self.looked = x.copy()
         if residual < self.best or self._looks == 0:
-            self.best, self._point = residual, x.copy()
+            self.best, self._point = residual, self.looked
         self._looks += 1
         if self._size > 0:
             self._last_look = (residual, self._size)
