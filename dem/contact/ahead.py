@@ -94,7 +94,7 @@ class Course(NamedTuple):
 Moving = tuple[Floats, Floats, Bools, float]  #: a `Course`
 Paired = tuple[Ints, Ints, Ints, Floats]  #: of pairs rows of shapes (m,), of contacts the pair (nc,), the reach (m,)
 Touched = tuple[Floats, Floats, Floats]  #: a `Touch`
-Touching = tuple[Floats, Floats, Floats, Floats]  #: a `Touch`, and normals of `dem.contact.primitives.lasting`
+Touching = tuple[Floats, Floats, Floats, Floats]  #: a `Touch`, and what `dem.contact.primitives.at_start` gives
 
 
 @inlined
@@ -146,7 +146,7 @@ def turn_ahead(
 
     `arcs` (nc, 4, 3) are as of `dem.contact.convex.arcs_of`; empty without such shapes."""
     (kind, row, size, _), (center, quaternion), (place, _, _, dt) = forms, poses, course
-    (i, j, pair, reach), (point, normal, gap, lasting) = pairs, touch
+    (i, j, pair, reach), (point, normal, gap, before) = pairs, touch
     moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
     touched = np.zeros((len(pair), 4))
     deep, found, wide = np.empty(len(pair), np.int64), 0, 0
@@ -171,7 +171,7 @@ def turn_ahead(
             continue
 
         # What rolls, and which contacts keep the normal of the start.
-        given, start = not (guest.moves and host.moves), of_start(lasting, c, sign)
+        given, start = not (guest.moves and host.moves), of_start(before, c, sign)
         if here and given and gap[c] <= CLOSE * guest.radius:
             start = as_found
         if here and host.kind == SPHERE and not given:
@@ -199,12 +199,10 @@ def turn_ahead(
             other = seat if host.moves else other
 
         if guest.kind == SPHERE and given and not lasts:
-            time, at_touch = dt, n
             if here:
                 time, at_touch = _touch(guest, host, between, as_found, gap[c], dt, quaternion[b], size[b])
-            elif linear[c] > 0.0 and end < 0.0:  # on its host as at the end
-                time = h * linear[c] / (linear[c] - end)
-                at_touch = after_turn(n, host.spin, time - h)
+            else:
+                time, at_touch = _touch_between(guest, host, before, c, sign, (as_found, end), h)
             if time < dt and dot(at_touch, n) < SAME:
                 for k in range(3):
                     touched[c, k] = sign * at_touch[k]
@@ -292,6 +290,25 @@ def _touch(guest, host, between, normal, gap, dt, quaternion, size):
 
 
 @inlined
+def _touch_between(guest, host, before, c, sign, last, h):
+    """The same of a sphere whose normal and gap at the start are those of `nearest_at_start`, and the `last` ones, with
+    the host put back, those of the end after h; infinite where it does not touch. The centre of the curve of the host
+    goes straight as seen from the sphere."""
+    if not len(before) or dot(before[c], before[c]) == 0.0:
+        return np.inf, last[0]
+    far, gap = guest.radius + before[c, 4], before[c, 3]
+    start = plus(_ZERO, sign * (far + gap), before[c])
+    way = plus(plus(_ZERO, far + last[1], last[0]), -1.0, start)
+    closing, square, left = dot(start, way), dot(way, way), gap * (2.0 * far + gap)
+    root = closing * closing - square * left
+    if closing >= 0.0 or root <= 0.0:
+        return np.inf, last[0]
+    share = left / (np.sqrt(root) - closing)
+    n = plus(start, share, way)
+    return share * h, after_turn(plus(_ZERO, 1.0 / np.sqrt(dot(n, n)), n), host.spin, share * h)
+
+
+@inlined
 def _found_at_end(guest, host, apart, h, normal, spot, gap):
     """The same of a guest that was found where `seen_from` puts it, at a `spot` of its host: they turn with this."""
     n, middle = after_turn(normal, host.spin, h), after_turn(spot, host.spin, h)
@@ -363,34 +380,44 @@ def _before(side, dt):
 
 
 @inlined
-def of_start(lasting, c, sign):
-    """The normal of the start that the contact c keeps, sign times it; zero where it does not, or none does."""
-    if not len(lasting):
+def of_start(before, c, sign):
+    """The normal of the start that the contact c keeps, sign times it, as of `nearest_at_start`; zero where it does
+    not, or none does."""
+    if not len(before) or before[c, 3] > 0.0:
         return 0.0, 0.0, 0.0
-    return sign * lasting[c, 0], sign * lasting[c, 1], sign * lasting[c, 2]
+    return sign * before[c, 0], sign * before[c, 1], sign * before[c, 2]
 
 
 @loop
-def nearest_normals(
-    forms: Forms, inner: Floats, guest: Ints, pair: Ints, touch: Touched, now_pair: Ints, now: Touched
+def nearest_at_start(
+    forms: Forms, inner: Floats, guest: Ints, sign: Floats, pair: Ints, touch: Touched, now_pair: Ints, now: Touched
 ) -> Floats:
-    """Return for contacts (k,) of guests in these rows the normals (k, 3) that they have now: of the contacts now (l,)
-    of the same pair that touch, at most NEAREST half thicknesses of the guest away, that of nearly the same direction;
-    zeros where there is none."""
-    (kind, _, size, _), (point, normal, _), (now_point, now_normal, now_gap) = forms, touch, now
-    out, last, before = np.zeros(normal.shape), np.full(pair.max() + 1, -1), np.empty(len(now_pair), np.int64)
+    """Return for contacts (k,) of guests in these rows what (k, 5) they are now: normal, gap, zero if they touch, and
+    the radius by which the host is curved there. Taken is of the contacts now (l,) of the same pair, at most NEAREST
+    half thicknesses of the guest away, that of nearly the same direction, before others one that touches; zeros where
+    there is none. `sign` (k,) is 1 where normals point from guest to host, else -1."""
+    (kind, _, size, _), (point, normal, gap), (now_point, now_normal, now_gap) = forms, touch, now
+    out, last, before = np.zeros((len(pair), 5)), np.full(pair.max() + 1, -1), np.empty(len(now_pair), np.int64)
     for n in range(len(now_pair)):
         before[n], last[now_pair[n]] = last[now_pair[n]], n
     for c in range(len(pair)):
-        thick, best, n = _thickness(kind[guest[c]], size[guest[c]], inner), LEAST_COSINE, last[pair[c]]
+        thick, best, touches, n = _thickness(kind[guest[c]], size[guest[c]], inner), LEAST_COSINE, False, last[pair[c]]
         while n >= 0:
-            square, cosine = 0.0, 0.0
+            square, cosine, close = 0.0, 0.0, now_gap[n] <= CLOSE * thick
             for k in range(3):
                 square += (now_point[n, k] - point[c, k]) ** 2
                 cosine += now_normal[n, k] * normal[c, k]
-            if cosine > best and square < (NEAREST * thick) ** 2 and now_gap[n] <= CLOSE * thick:
-                best = cosine
-                out[c] = now_normal[n]
+            better = cosine > best if close == touches else close and cosine > LEAST_COSINE
+            if better and square < (NEAREST * thick) ** 2:
+                best, touches = cosine, close
+                bend, along = 0.0, 0.0
+                for k in range(3):
+                    out[c, k], turn = now_normal[n, k], now_normal[n, k] - normal[c, k]
+                    way = 0.5 * sign[c] * (gap[c] * normal[c, k] - now_gap[n] * now_normal[n, k])
+                    along += sign[c] * turn * (point[c, k] - now_point[n, k] + way)
+                    bend += turn * turn
+                out[c, 3] = 0.0 if close else now_gap[n]
+                out[c, 4] = max(along / bend, 0.0) if bend > 2.0 * (1.0 - SAME) else 0.0
             n = before[n]
     return out
 

@@ -639,7 +639,7 @@ def arcs_of(
     the step and at its start, of hosts at these two. As a surface rolls on, the contact stays where its normal is.
     Zeros of points that go with the body, and of shapes of other kinds."""
     (kind, row, size, _), (center, quaternion) = forms, poses
-    (place, velocity, _, _), (i, j, pair, _), (point, normal, gap, lasting) = course, pairs, touch
+    (place, velocity, _, _), (i, j, pair, _), (point, normal, gap, before) = course, pairs, touch
     what, numbers, radii, _ = supports
     arcs = np.zeros((len(pair), 4, 3))
     for c in range(len(pair)):
@@ -673,7 +673,7 @@ def arcs_of(
             if not _other_rolls(which, numbers[f], x, y, z, p / scale, q / scale, r / scale):
                 continue
             at_end = _other_arc(which, numbers[f], x, y, z)
-            first = of_start(lasting, c, out * sign)
+            first = of_start(before, c, out * sign)
             x, y, z = _into(start, first if dot(first, first) > 0.0 else ahead)
             at_start = _other_arc(which, numbers[f], x, y, z)
             if dot(at_end, at_end) == 0.0 or dot(at_start, at_start) == 0.0:

@@ -12,7 +12,7 @@ from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, CAPSULE, CLUMP, CONVEX, MESH, PLANE, POLYHEDRON, SPHERE, enclosing_radius
 from dem.compiled import inlined, loop
-from dem.contact.ahead import Course, Forms, Poses, guest_is_second, nearest_normals, seen_from, turn_ahead, vector_of
+from dem.contact.ahead import Course, Forms, Poses, guest_is_second, nearest_at_start, seen_from, turn_ahead, vector_of
 from dem.contact.clumps import Members, members, more_numbers, spread
 from dem.contact.convex import (
     Solids,
@@ -237,7 +237,7 @@ def touches_ahead(
     rows of bodies, so many, are `grains`. A deep gap is no deeper than the pair overlaps at the start, and none is
     wider than `delta` there."""
     found = touches(table, i, j, delta, course)
-    touch = (*found.touch, lasting(table, i, j, delta, found, course, grains))
+    touch = (*found.touch, at_start(table, i, j, delta, found, course, grains))
     given = *table.tables(), course[:], (i, j, found.pair, delta), touch
     arcs = arcs_of(*given, table.supports[:]) if table.curved else np.zeros((0, 4, 3))
     moved, swing, linear, touched, deep, wider = turn_ahead(*given, arcs)
@@ -253,15 +253,15 @@ def touches_ahead(
     return found, moved, swing, linear, touched
 
 
-def lasting(
+def at_start(
     table: Primitives, i: Ints, j: Ints, delta: Floats, found: Manifold, course: Course, grains: int
 ) -> Floats:
-    """The normals (nc, 3) of the start of the step for contacts of pairs of rows i, j (m,) that keep them, for others
-    zeros; no row if none does. They are kept by round guests on flat faces of hosts that impulses move, and by what
-    touches bodies of prescribed motion. The first rows of bodies, so many, are `grains`: these are no guests on faces,
-    as what rests on a bed of them would tremble. Those of contacts that are found where bodies are `turn_ahead`
-    knows."""
-    none = np.zeros((0, 3))
+    """What contacts (nc,) of pairs of rows i, j (m,) are at the start of the step, as of `nearest_at_start`: of those
+    with bodies of prescribed motion; and the normals of round guests on flat faces of hosts that impulses move. The
+    normals of what touches are kept. Of others zeros; no row if there are none. The first rows of bodies, so many, are
+    `grains`: these are no guests on faces, as what rests on a bed of them would tremble. Those of contacts that are
+    found where bodies are `turn_ahead` knows."""
+    none = np.zeros((0, 5))
     if not table.bounded:
         return none
     kind, part = table.kind, table.row >= grains
@@ -270,18 +270,18 @@ def lasting(
     if not (given.any() or rolls.any()):
         return none
     guest, host, swap = guests_and_hosts(kind, i, j, found.pair)
-    normal, ahead = np.zeros((len(found.pair), 3)), (kind != SPHERE) & (kind != BOX)
+    before, ahead = np.zeros((len(found.pair), 5)), (kind != SPHERE) & (kind != BOX)
     if len(kept := np.flatnonzero((given[guest] | given[host]) & ((kind[guest] != SPHERE) | ahead[host]))):
         pairs, row = np.unique(found.pair[kept], return_inverse=True)
-        now = touches(table, i[pairs], j[pairs], delta[pairs])
-        of_pairs = table.tables()[0], table.hulls.inner, guest[kept]
-        normal[kept] = nearest_normals(*of_pairs, row, found.touch.take(kept)[:], now.pair, now.touch[:])
+        now, sign = touches(table, i[pairs], j[pairs], delta[pairs]), np.where(swap[kept], -1.0, 1.0)
+        of_pairs = table.tables()[0], table.hulls.inner, guest[kept], sign
+        before[kept] = nearest_at_start(*of_pairs, row, found.touch.take(kept)[:], now.pair, now.touch[:])
     faces = course.moves[table.row] & (kind != SPHERE) & (kind != CAPSULE)
     rows = np.flatnonzero(faces[host] & rolls[guest])
     if len(rows):
         flat = rows[_on_faces(table, found, rows, host[rows], np.where(swap[rows], 1.0, -1.0)[:, None])]
-        normal[flat] = found.touch.normal[flat]
-    return normal
+        before[flat, :3] = found.touch.normal[flat]
+    return before
 
 
 def _on_faces(table: Primitives, found: Manifold, rows: Ints, host: Ints, sign: Floats) -> Bools:

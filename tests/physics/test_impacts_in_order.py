@@ -7,10 +7,9 @@ import pytest
 from mpi4py import MPI
 
 import pctt
-from dem.mesh import Mesh
 from dem.motion import Rotation
 from dem.scene import Scene
-from dem.shapes import Box, Plane, Sphere
+from dem.shapes import Box, Capsule, Cylinder, Mesh, Plane, Sphere, Superellipsoid
 
 R, DENSITY = 0.01, 2500.0
 EXACT = {"tol": 1e-9, "closing_work": np.inf, "delta": 0.05 * R}
@@ -160,17 +159,22 @@ def test_ranks_follow_the_same_impacts(ranks):
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 
+FOLD = [(x, y, z) for x, y in ((0, 0), (1, 0), (0, -1)) for z in (-1, 1)]
 HOSTS = {
     "sphere": (Sphere(3 * R), 4 * R),
+    "capsule": (Capsule(3 * R, 9 * R), 4 * R),
+    "cylinder": (Cylinder(3 * R, 9 * R), 4 * R),
+    "superellipsoid": (Superellipsoid((3 * R, 3 * R, 5 * R), (2, 2)), 4 * R),
     "edge of a box": (Box((1.0, 1.0, 1.0), center=(1.0, -1.0, 0.0)), R),
+    "edge of a mesh": (Mesh(FOLD, [(0, 1, 2), (1, 2, 3), (0, 1, 4), (1, 4, 5)]), R),
+    "corner of a mesh": (Mesh([(0, 0, 0), (1, 0, 0), (0, -1, 0)], [(0, 1, 2)]), R),
 }
 
 
 @pytest.mark.parametrize("host", HOSTS)
-@pytest.mark.parametrize("mu", [0.0, 0.2])
-def test_a_ball_bounces_off_a_curved_body_where_it_touches_that(host, mu):
+def test_a_ball_bounces_off_a_curved_body_where_it_touches_that(host):
     """Its normal there, not that of the end of the step, which at an edge was 10 degrees off."""
-    shape, reach = HOSTS[host]
+    (shape, reach), mu = HOSTS[host], 0.2
     n, coming = np.array([0.8, -0.6, 0.0]), np.array([1.0, 0.0, 0.0])
     along = np.array([0.6, 0.8, 0.0])
     push, slide = 1.5 * 0.8, 0.6
