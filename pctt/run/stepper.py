@@ -280,12 +280,12 @@ def _refuse_squeezed(world: World, result: ccp.Result) -> None:
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
-    G, point, key, soft = system.problem_map, system.point, system.key, system.compliance
     r: Array = system.r
-    if (resists := system.resistance) is None:
-        return ccp.ConeProblem(comm, r, system.mu, G=G, point=point, key=key, compliance=soft)
-    r, cones = np.concatenate([r, resists.velocity]), ccp.RollingCones(system.mu, *resists.most)
-    return ccp.ConeProblem(comm, r, cones=cones, G=G, point=point, key=key, compliance=soft)
+    cones: ccp.FrictionCones | ccp.RollingCones = ccp.FrictionCones(system.mu)
+    if (resists := system.resistance) is not None:
+        r, cones = np.concatenate([r, resists.velocity]), ccp.RollingCones(system.mu, *resists.most)
+    of_contacts = system.point, system.key, system.compliance
+    return ccp.ConeProblem.of_bodies(comm, r, cones, system.problem_map, *of_contacts)
 
 
 def _peak_memory(comm: MPI.Comm) -> int:
