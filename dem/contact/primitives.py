@@ -249,7 +249,8 @@ def touches_ahead(
     if wider:
         wide = found.touch.gap > delta[found.pair]
         found = Manifold(found.pair[~wide], found.feature[~wide], found.touch.take(~wide))
-        moved, swing, linear, touched = moved[~wide], swing[~wide], linear[~wide], touched[~wide]
+        moved, swing, linear = moved[~wide], swing[~wide], linear[~wide]
+        touched = touched[~wide] if len(touched) else touched
     return found, moved, swing, linear, touched
 
 
