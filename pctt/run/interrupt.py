@@ -6,7 +6,7 @@ tell each other. The same signal once more ends the rank at once.
 
 from __future__ import annotations
 
-import inspect
+import _signal  # that of `signal` looks up names for numbers, which each step would wait for
 import signal
 import sys
 import threading
@@ -22,8 +22,6 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP, signal.
 
 _noted: list[int] = []
 
-#: Without names for numbers, which each step would wait for.
-_handler, _set_handler = map(inspect.unwrap, (signal.getsignal, signal.signal))
 
 
 class InterruptError(RuntimeError):
@@ -55,15 +53,15 @@ def is_requested(comm: MPI.Comm) -> bool:
 def uninterrupted() -> Iterator[None]:
     """A block, or a function, in which Ctrl-C waits until its end: files and states are whole then, and no library is
     left amid a call. For scripts and notebooks; the program notes signals by itself."""
-    mine = _handler(signal.SIGINT) is signal.default_int_handler
+    mine = _signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not mine or threading.current_thread() is not threading.main_thread():
         yield
         return
     asked: list[int] = []
-    _set_handler(signal.SIGINT, lambda number, frame: asked.append(number))
+    _signal.signal(signal.SIGINT, lambda number, frame: asked.append(number))
     try:
         yield
     finally:
-        _set_handler(signal.SIGINT, signal.default_int_handler)
+        _signal.signal(signal.SIGINT, signal.default_int_handler)
     if asked:
         raise KeyboardInterrupt
