@@ -63,6 +63,7 @@ class ContactMap:
             ghost = np.zeros(halo.rows, bool)
             ghost[halo.ghosts] = True
             self._first_away = first_touching(body, ghost)
+        self._spreads = threads() > 1
         self._set_parts()
         self._flops = 45 * self.rows + 6 * self.columns
 
@@ -177,7 +178,7 @@ class ContactMap:
         """out = v + G' H G v (columns, 6); out is C-contiguous."""
         v = v.reshape(-1, 6)
         self._enter(v)
-        if threads() > 1:
+        if self._spreads:
             _, arm, body = self._arrays
             self.halo.end_update(self._w)
             loops.find_forces_through(arm, body, weight, self._w, self._forces)
@@ -267,7 +268,7 @@ class ContactMap:
     def _push(self, g: Floats, m: Floats) -> None:
         """The same of impulses (nc, 3) that have the precision of the map."""
         self._pushed[:] = 0.0
-        if threads() > 1:
+        if self._spreads:
             loops.find_forces(self._arrays[0], g, self._forces)
             if len(self._pushed):
                 loops.add_pushes(self._arrays[1], self._forces, self._pushed)
@@ -342,7 +343,7 @@ class ContactMap:
         rows = CompactRows(frame, given.arm, given.body, given.root, given.columns)
         other = ContactMap(self.comm, rows, self.halo, self.body, precision, mass)
         other.log_flops = self.log_flops
-        if threads() > 1:
+        if self._spreads:
             other._ends = self._ends
         return other
 

@@ -77,7 +77,7 @@ class Stepper:
 
     def use(self, settings: Settings) -> None:
         """Make the next steps by these settings."""
-        self.settings, self._limits = settings, settings.limits
+        self.settings, self._limits = settings, ccp.watched(self.world.comm, settings.limits)
 
     def __enter__(self) -> Stepper:
         return self
@@ -183,7 +183,7 @@ class Stepper:
     ) -> ccp.Result:
         """What the method of the settings makes of a problem."""
         settings = self.settings
-        return ccp.solve(problem, guess, settings.solver, limits, settings.options, newton, settings.law)
+        return ccp.solved(problem, guess, settings.solver, limits, settings.options, newton, settings.law)
 
     def _by_itself(self, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits) -> ccp.Result:
         """The same of a part of the problem of a step."""

@@ -46,7 +46,7 @@ def collectives(step):
 
 def is_in_solve(frame):
     while frame is not None:
-        if frame.f_code is ccp.solve.__code__:
+        if frame.f_code is ccp.solved.__code__:
             return True
         frame = frame.f_back
     return False

@@ -85,7 +85,8 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     y = gradient = np.empty(now.x.shape, scaled.precision)
     lipschitz, whole = options.lipschitz, True
     theta, beta, step, least = options.theta, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, its least since beta = 0
-    most, flattest, before = 1.0, np.inf, (np.zeros(now.x.shape, scaled.precision), scaled.b)  # of beta; curvature; at the last look
+    most, flattest = 1.0, np.inf  # of beta; curvature
+    before = np.zeros(now.x.shape, scaled.precision), scaled.b  # at the last look
     while True:
         if progress.is_due(math.sqrt(step)):
             (now, last, new), y = scaled.restore(now, last, new), gradient
