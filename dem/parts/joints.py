@@ -210,8 +210,8 @@ class Joint(Constraint):
 
     def conditions(self, error: Floats, dt: float) -> list[Condition]:
         at = error[self.coordinate]
-        holds = np.flatnonzero(KINDS[self.kind].holds).tolist()
-        found = [Condition(coordinate, HELD, -error[coordinate] / dt) for coordinate in holds]
+        holds = enumerate(KINDS[self.kind].holds)
+        found = [Condition(coordinate, HELD, -error[coordinate] / dt) for coordinate, held in holds if held]
         if self.driven:
             way = np.inf if self.target is None else min(max(self.target, self.low), self.high) - at
             most = np.inf if self.speed is None else self.speed

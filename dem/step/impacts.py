@@ -254,7 +254,7 @@ def struck(
         elif kind[c] == PAIR:
             free = not (presses[a] or presses[b]) if meets[c] else passes[c] and not (touches[a] or touches[b])
             marked[a], marked[b] = marked[a] or free, marked[b] or free
-    return kind, bounce, offset, marked, marked.any()
+    return kind, bounce, offset, marked, bool(marked.any())
 
 
 @loop

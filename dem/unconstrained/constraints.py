@@ -103,7 +103,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     for side in (0, 1):
         np.add.at(J, (np.arange(len(t)), row[which, side]), along[which, coordinates, side])
     root = ends.root
-    B = np.einsum("knx,nxy->kny", J, root).reshape(len(t), -1)
+    B: Floats = (J[:, :, None] @ root).reshape(len(t), -1)
     A, held, flat = B @ B.T, kind == HELD, J.reshape(len(t), -1)
     now = flat @ ends.velocity.ravel()
     left = _braked(A, t, bound, np.abs(way), held, now, flat @ ends.free.ravel(), dt)
@@ -118,7 +118,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     t, least, expected, pushed = left.copy(), np.inf, push.ravel(), B @ push.ravel()
     for number in range(ROUNDS):
         velocity, (spin, middle) = ends.free.copy(), np.full((2, count, 3), np.nan)
-        change = np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
+        change = _changes(root, expected)
         spun, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.spin_change[rows])
         spin[rows] = velocity[rows, 3:] = spun + ends.spin_change[rows]
         free = flat @ velocity.ravel()
@@ -140,7 +140,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
             least = differs
         if least <= 1e-7 * np.abs(expected).max():
             break
-        after = velocity + np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
+        after = velocity + _changes(root, expected)
         if dt * np.abs(after[:, 3:]).max(initial=0.0) > FAR:
             best = left, *best[1:]
             break
@@ -242,8 +242,12 @@ def _solved(
     if yields.any():  # else it is a projector, and I - K its own root
         value, vector = np.linalg.eigh(K)
         K = (vector * (1.0 - np.sqrt(np.clip(1.0 - value, 0.0, 1.0)))) @ vector.T
-    change = np.einsum("nxy,ny->nx", root, (B.T @ g).reshape(-1, 6))
-    return solver, g, change, K
+    return solver, g, _changes(root, B.T @ g), K
+
+
+def _changes(root: Floats, momenta: Floats) -> Floats:
+    """What mass-scaled momenta (6 n,) change of velocities (n, 6), with the roots (n, 6, 6) of M^-1."""
+    return (root @ momenta.reshape(-1, 6, 1))[:, :, 0]
 
 
 def constrained(world: World) -> tuple[Ints, Ints]:

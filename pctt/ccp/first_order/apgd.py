@@ -109,7 +109,8 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
             if not (length > 0 and curvature > allowed):  # also ends on a number that is none
                 break
             lipschitz = options.margin * curvature / length
-        progress.watch(curvature, length, lipschitz)
+        if curvature < 0.0:
+            progress.watch(curvature, length, lipschitz)
         step = lipschitz**2 * length
         if uphill > 0 or (coulomb and step > options.growth * least):
             theta, beta, least = options.theta, 0.0, np.inf

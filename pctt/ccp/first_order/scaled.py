@@ -323,8 +323,8 @@ class Progress:
         return not self.reason
 
     def watch(self, curvature: float, square: float, largest: float) -> None:
-        """Note d'Ad and |d|^2 of a step d, and an estimate of the largest eigenvalue of A, which is one at least."""
-        if curvature < 0.0 < square:
+        """Note a negative d'Ad and |d|^2 of a step d, and an estimate of the largest eigenvalue of A, one at least."""
+        if square > 0:
             self._lowest = min(self._lowest, curvature / (square * max(largest, 1.0)))
 
     @property
