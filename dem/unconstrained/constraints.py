@@ -103,7 +103,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     for side in (0, 1):
         np.add.at(J, (np.arange(len(t)), row[which, side]), along[which, coordinates, side])
     root = ends.root
-    B: Floats = (J[:, :, None] @ root).reshape(len(t), -1)
+    B = np.matmul(J[:, :, None], root).reshape(len(t), -1)
     A, held, flat = B @ B.T, kind == HELD, J.reshape(len(t), -1)
     now = flat @ ends.velocity.ravel()
     left = _braked(A, t, bound, np.abs(way), held, now, flat @ ends.free.ravel(), dt)

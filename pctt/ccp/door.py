@@ -253,13 +253,8 @@ def _map(comm: MPI.Comm, G: BlockRows | CompactRows | ContactMap) -> ContactMap:
     if isinstance(G, BlockRows):
         return BlockMap(comm, G)
     contact_map = G if isinstance(G, ContactMap) else ContactMap(comm, G)
-    count_products(contact_map)
-    return contact_map
-
-
-def count_products(contact_map: ContactMap) -> None:
-    """Let PETSc's log count the operations of a map."""
     contact_map.log_flops = PETSc.Log.logFlops
+    return contact_map
 
 
 def _by_N(comm: MPI.Comm, nc: int, width: int, N: Any) -> GivenOperator:  # noqa: N802 - as in formulas

@@ -108,8 +108,7 @@ class ConeProblem:
     ) -> ConeProblem:  # fmt: skip
         """The same of a program's own contacts, whose arrays fit and need no check; ``compliance`` (nc, 2).
         Collective."""
-        problem = object.__new__(cls)
-        door.count_products(G)
+        problem, G.log_flops = object.__new__(cls), PETSc.Log.logFlops
         problem._begin(comm, door.Contacts(3, None, r, cones.mu, r), cones, G, point, key, compliance)
         return problem
 
