@@ -101,7 +101,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     which, coordinates, kind, t, bound, way = (np.array(column) for column in zip(*asked))
     J, along = np.zeros((len(t), count, 6)), found.rows
     for side in (0, 1):
-        np.add.at(J, (np.arange(len(t)), row[which, side]), along[which, coordinates, side])
+        J[np.arange(len(t)), row[which, side]] += along[which, coordinates, side]
     root = ends.root
     B = np.matmul(J[:, :, None], root).reshape(len(t), -1)
     A, held, flat = B @ B.T, kind == HELD, J.reshape(len(t), -1)
@@ -111,7 +111,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     motors = np.isfinite(bound)
     slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
     slip = np.copysign(slip, left - now)
-    on, saturated = kind <= MOTOR, np.zeros(len(t))
+    on, saturated, decides = kind <= MOTOR, np.zeros(len(t)), motors.any() or (kind > MOTOR).any()
     inverse = _inverse(A, on)
     rows = unequal(ends.moments).nonzero()[0]
     known = ends.quaternion[rows], ends.velocity[rows, 3:], ends.moments[rows]
@@ -124,8 +124,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
         free = flat @ velocity.ravel()
         for _ in range(2 * len(t) + 1):
             g = _impulses(A, inverse, t, free, on, saturated)
-            wrong = _wrong(kind, t, bound, on, g, free + A @ g, 0.0)
-            if not wrong.any():
+            if not decides or not (wrong := _wrong(kind, t, bound, on, g, free + A @ g, 0.0)).any():
                 break
             on, saturated = _turned(kind, bound, on, saturated, g, wrong)
             inverse = _inverse(A, on)
