@@ -102,8 +102,8 @@ MOST = {  # the sums, as counted
     },
     "flows": {"a sheared cell": {"iterations": 1881}},
     "calls": {
-        "ten boxes": {"functions of Python": 68323}, "a pendulum": {"functions of Python": 54658},
-        "ten balls at rest": {"functions of Python": 40595},
+        "ten boxes": {"functions of Python": 66650}, "a pendulum": {"functions of Python": 53634},
+        "ten balls at rest": {"functions of Python": 39711},
     },
 }  # fmt: skip
 
