@@ -92,20 +92,20 @@ MOST = {  # the sums, as counted
     },
     "steps": {
         "thrown": {
-            "calls of compiled loops": 37971, "contacts of the search": 16033, "pairs in lists": 41886, "new lists": 6,
-            "iterations": 5829, "Newton steps": 12, "cone problems": 100,
+            "calls of compiled loops": 36266, "contacts of the search": 16022, "pairs in lists": 42084, "new lists": 6,
+            "iterations": 5685, "cone problems": 100,
         },
-        "halves of products": {"_set_velocities": 8710, "_push": 8459},
+        "halves of products": {"_set_velocities": 8350, "_push": 8090},
         "falling": {
-            "calls of compiled loops": 18818, "contacts of the search": 10993, "pairs in lists": 20357, "new lists": 4,
-            "iterations": 2007, "Newton steps": 29, "cone problems": 100,
+            "calls of compiled loops": 18193, "contacts of the search": 10995, "pairs in lists": 20357, "new lists": 4,
+            "iterations": 1998, "Newton steps": 29, "cone problems": 100,
         },
     },
     "flows": {"a sheared cell": {"iterations": 1881}},
     "memory": {"a bed": {"bytes of a grain": 3282}},
     "calls": {
-        "ten boxes": {"functions of Python": 75371}, "a pendulum": {"functions of Python": 81677},
-        "ten balls at rest": {"functions of Python": 46554},
+        "ten boxes": {"functions of Python": 66650}, "a pendulum": {"functions of Python": 53634},
+        "ten balls at rest": {"functions of Python": 39711},
     },
 }  # fmt: skip
 

@@ -142,13 +142,14 @@ def turn_ahead(
     and how many contacts have a gap that is wider than the reach of their pair.
 
     Where an open sphere closes with a body of prescribed motion, `touched` are its normal at the time of touch, and
-    that time after the start [s]; zeros where that normal is the one of the end, or none is known.
+    that time after the start [s]; zeros where that normal is the one of the end, or none is known. It has no row if
+    all are zeros.
 
     `arcs` (nc, 4, 3) are as of `dem.contact.convex.arcs_of`; empty without such shapes."""
     (kind, row, size, _), (center, quaternion), (place, _, _, dt) = forms, poses, course
     (i, j, pair, reach), (point, normal, gap, before) = pairs, touch
     moved, swing, linear = np.zeros((len(pair), 3)), np.zeros((len(pair), 3)), gap.copy()
-    touched = np.zeros((len(pair), 4))
+    touched, comes = np.zeros((len(pair), 4)), False
     deep, found, wide = np.empty(len(pair), np.int64), 0, 0
     for c in range(len(pair)):
         one, two = i[pair[c]], j[pair[c]]
@@ -206,7 +207,7 @@ def turn_ahead(
             if time < dt and dot(at_touch, n) < SAME:
                 for k in range(3):
                     touched[c, k] = sign * at_touch[k]
-                touched[c, 3] = time
+                touched[c, 3], comes = time, True
 
         own, their = Arms(core, arm, arc, first_arc), Arms(seat, other, bow, first_bow)
         more = _swing((guest, own), (host, their), n, early, h, dt)
@@ -224,7 +225,7 @@ def turn_ahead(
             swing[c, k] = sign * more[k]
     for c in range(len(pair)):
         wide += gap[c] > reach[pair[c]]
-    return moved, swing, linear, touched, deep[:found], wide
+    return moved, swing, linear, touched[: len(pair) if comes else 0], deep[:found], wide
 
 
 class Side(NamedTuple):

@@ -119,7 +119,7 @@ class Primitives(NamedTuple):
 
     def polyhedron(self, rows: Any) -> Polyhedra:
         """Boxes are some."""
-        rows = np.arange(len(self.kind)) if isinstance(rows, slice) else rows
+        rows = np.arange(rows.start, rows.stop) if isinstance(rows, slice) else rows
         given = self.kind, self.center, self.quaternion, self.size, self.hulls.radius
         return Polyhedra(*frames_of_hulls(*given, rows), self.hulls)
 
@@ -221,10 +221,15 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
     if not len(others):
         return found[0]
     number, guest, host, reach, sign, spans = by_kinds(table.kind, i, j, delta, others)
+    center, turn = table.center[guest], table.quaternion[guest]
+    if course is not None:
+        center, turn, travel = seen_from(*table.tables(), course[:], guest, host)
+        reach += travel
+    guests = table.moved(guest, center, turn)
     for one, two, first, end in spans.tolist():
         if (one, two) in _TOUCH:
             here = slice(first, end)
-            pair, feature, touch = _touching(table, (one, two), guest[here], host[here], reach[here], course)
+            pair, feature, touch = _touching(table, (one, two), guests, host, reach, here)
             found.append(Manifold(of_all(pair, number[here], sign[here], touch.normal), feature, touch))
     found = [part for part in found if len(part.pair)] or found[:1]
     return joined(found) if len(found) > 1 else found[0]
@@ -249,7 +254,8 @@ def touches_ahead(
     if wider:
         wide = found.touch.gap > delta[found.pair]
         found = Manifold(found.pair[~wide], found.feature[~wide], found.touch.take(~wide))
-        moved, swing, linear, touched = moved[~wide], swing[~wide], linear[~wide], touched[~wide]
+        moved, swing, linear = moved[~wide], swing[~wide], linear[~wide]
+        touched = touched[~wide] if len(touched) else touched
     return found, moved, swing, linear, touched
 
 
@@ -297,22 +303,19 @@ def _on_faces(table: Primitives, found: Manifold, rows: Ints, host: Ints, sign: 
 
 
 def _touching(
-    table: Primitives, kinds: tuple[int, int], i: Ints, j: Ints, delta: Floats, course: Course | None
+    table: Primitives, kinds: tuple[int, int], guests: Primitives, host: Ints, delta: Floats, here: slice
 ) -> Manifold:
-    """The contacts of pairs of rows i, j (m,) of two kinds; with meshes mesh by mesh."""
+    """The contacts of those pairs, of all guests with the rows `host` (m,), that are of two kinds; with meshes mesh by
+    mesh."""
     contacts, first, second = _TOUCH[kinds]
-    if course is None:
-        guests = table.moved(i, table.center[i], table.quaternion[i])
-    else:
-        center, turn, travel = seen_from(*table.tables(), course[:], i, j)
-        guests, delta = table.moved(i, center, turn), delta + travel
     further = (table.hulls,) if first is Primitives.solid or second is Primitives.solid else ()
+    host, delta = host[here], delta[here]
     if second is not None:
-        return contacts(first(guests, slice(None)), second(table, j), delta, *further)
+        return contacts(first(guests, here), second(table, host), delta, *further)
     found = []
-    for mesh in np.unique(j):
-        rows = np.flatnonzero(j == mesh)
-        contact = contacts(first(guests, rows), table.mesh(int(mesh)), delta[rows], *further)
+    for mesh in np.unique(host):
+        rows = np.flatnonzero(host == mesh)
+        contact = contacts(first(guests, here.start + rows), table.mesh(int(mesh)), delta[rows], *further)
         found.append(contact._replace(pair=rows[contact.pair]))
     return joined(found)
 

@@ -60,7 +60,7 @@ class Contacts:
     #: with these arms, as bodies turn; None: nothing [m/s]
     swing: Floats | None = None
     #: (nc, 4) of spheres that come to bodies of prescribed motion the normal at the time of touch, and that time after
-    #: the start of the step [s], or zeros; None: nowhere, or `dem.step.impacts` has taken it
+    #: the start of the step [s], or zeros; None: nowhere on this rank, or `dem.step.impacts` has taken it
     touched: Floats | None = None
     drift: Floats | None = None  #: (nc, 3) what the shear adds to the velocity of b relative to a; None: nothing [m/s]
     #: (nc,) the normal velocities after impacts that `dem.step.impacts` follows; -inf where two do not meet, NaN where
@@ -226,7 +226,7 @@ def _narrow(
     motions = _motions(world, near, images, free.prescribed)
     course = Course(near.bodies.position, motions, bodies.is_dynamic(near.bodies), free.dt)
     found, moved, swing, linear, touched = touches_ahead(table, *pairs, course, near.grains + near.ghosts)
-    return found, {"moved": moved, "swing": swing, "linear": linear, "touched": touched}
+    return found, {"moved": moved, "swing": swing, "linear": linear, "touched": touched if len(touched) else None}
 
 
 def _put_in_order(world: World, contacts: Contacts, pair: Ints, whole: bool) -> None:

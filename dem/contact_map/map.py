@@ -62,6 +62,7 @@ class ContactMap:
             ghost = np.zeros(halo.rows, bool)
             ghost[halo.ghosts] = True
             self._first_away = first_touching(body, ghost)
+        self._spreads = threads() > 1
         self._set_parts()
         self._flops = 45 * self.rows + 6 * self.columns
 
@@ -90,7 +91,7 @@ class ContactMap:
     def velocities(self, v: Floats) -> Floats:
         """G v (nc, 3)."""
         y, v = np.zeros((self.rows, 3), self.precision), shaped("velocities of bodies", v, self.columns, 6)
-        self._enter(v)
+        self.mass.scale(v, self._w)
         self._set_velocities(y, y, self.mass.rates_of(v))
         self.log_flops(self._flops)
         return y
@@ -106,7 +107,7 @@ class ContactMap:
         y = shaped("velocities of contacts", y, self.rows, 3)
         self._collect(g, self._m)
         loops.scale(self.mass.unshared, self._m, self._w)
-        self._set_velocities(y, y, self._send(self._share(self._m) if self.mass.shared else None))
+        self._set_velocities(y, y, self._add_shared(self._share(self._m)) if self.mass.shared else self.mass.none)
         self.log_flops(2 * self._flops)
 
     def shared(self, g: Floats) -> Floats:
@@ -157,11 +158,10 @@ class ContactMap:
 
     def find_velocities(self, image: Floats, last: Floats, beta: float, before: Floats, y: Floats) -> None:
         """y = before + G G' z (nc, 3) for the z whose image is image + beta (image - last)."""
-        mass, shared = self.mass, None
+        mass = self.mass
         loops.scale_extrapolated(mass.unshared, image, last, beta, self._w)
-        if mass.shared:
-            shared = self._shared_at(image, last, beta)
-        self._set_velocities(before, y, self._send(shared))
+        rate = self._add_shared(self._shared_at(image, last, beta)) if mass.shared else mass.none
+        self._set_velocities(before, y, rate)
         self.log_flops(self._flops + 12 * self.columns)
 
     def energy_of_step(self, new: Floats, image: Floats, last: Floats, beta: float) -> float:
@@ -185,8 +185,9 @@ class ContactMap:
     def through(self, weight: Floats, v: Floats, out: Floats) -> None:
         """out = v + G' H G v (columns, 6); out is C-contiguous."""
         v = v.reshape(-1, 6)
-        self._enter(v)
-        if threads() > 1:
+        self.mass.scale(v, self._w)
+        self.halo.begin_update(self._w)
+        if self._spreads:
             _, arm, body = self._arrays
             self.halo.end_update(self._w)
             loops.find_forces_through(arm, body, weight, self._w, self._forces)
@@ -235,36 +236,24 @@ class ContactMap:
         loops.add_momenta_on(first, *self._arrays, self._floats(shaped("impulses", g, self.rows, 3)), sums)
         return sums
 
-    def _enter(self, v: Floats) -> None:
-        """Store R v for the own bodies, and begin to send it to the ranks with ghosts of them.
-
-        The caller must call `end_update` later.
-        """
-        self.mass.scale(v, self._w)
-        self.halo.begin_update(self._w)
-
     def _share(self, m: Floats) -> Floats:
         """The shared coordinates (mass.shared, 6) of the impulses that were collected, with the momenta m."""
         shared = np.zeros((self.mass.shared, 6), self.precision)
         self.mass.share(m, self._pushed, shared)
         return shared
 
-    def _send(self, shared: Floats | None) -> Floats:
-        """Add the velocities by shared coordinates, if there are any, to those of the own bodies, and begin to send
-        them as `_enter`; returns the rates (axes,) of a cell."""
-        rates, mass = self.mass.none, self.mass
-        if shared is not None:
-            mass.add_bodies(shared, self._w)
-            rates = mass.rates(shared)
-        if self.halo.talks:
-            self.halo.begin_update(self._w)
-        return rates
+    def _add_shared(self, shared: Floats) -> Floats:
+        """Add the velocities by shared coordinates to those of the own bodies; returns the rates (axes,) of a cell."""
+        self.mass.add_bodies(shared, self._w)
+        return self.mass.rates(shared)
 
     def _set_velocities(self, before: Floats, y: Floats, rate: Floats) -> None:
-        """y = before + D' w (nc, 3), with the velocities w that are on their way, and the rates of a cell."""
-        here, frame, arm, body = self._own
+        """y = before + D' w (nc, 3), with the velocities w of the own bodies, and the rates of a cell."""
+        (here, frame, arm, body), talks = self._own, self.halo.talks
+        if talks:
+            self.halo.begin_update(self._w)
         loops.set_velocities(frame, arm, body, before[here], y[here], self._w, rate)
-        if self.halo.talks:
+        if talks:
             self.halo.end_update(self._w)
         for here, frame, arm, body in self._away:
             loops.set_velocities(frame, arm, body, before[here], y[here], self._w, rate)
@@ -276,7 +265,7 @@ class ContactMap:
     def _push(self, g: Floats, m: Floats) -> None:
         """The same of impulses (nc, 3) that have the precision of the map."""
         self._pushed[:] = 0.0
-        if threads() > 1:
+        if self._spreads:
             loops.find_forces(self._arrays[0], g, self._forces)
             if len(self._pushed):
                 loops.add_pushes(self._arrays[1], self._forces, self._pushed)
@@ -354,7 +343,7 @@ class ContactMap:
         other.log_flops = self.log_flops
         if precision is self.precision:
             other._w, other._m = self._w, self._m
-        if threads() > 1:
+        if self._spreads:
             other._ends = self._ends
         return other
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,9 @@ from dem.together import together
 #: The fields of a world that a step changes; what these refer to is replaced, and never changed in place.
 STATE = (
     "grains", "large", "slabs", "only_spheres", "any_spheres", "lists", "memory", "cell", "passages", "time", "step",
-    "spare",
+    "spare", "owned",
 )  # fmt: skip
+_state_of = attrgetter(*STATE)
 
 
 @dataclass(repr=False)
@@ -57,6 +59,8 @@ class World:
     slabs: Ints = field(init=False)  #: (size + 1,) global index of the first grain of each rank, and the end
     only_spheres: bool = field(init=False)  #: whether all grains, of all ranks, are spheres
     any_spheres: bool = field(init=False)  #: whether any is one
+    #: number of bodies whose rows this rank owns: its grains, and on the last rank the large bodies
+    owned: int = field(init=False)
     large_moves: bool = field(init=False)  #: whether forces move any large body
 
     #: Kinds and names of the parts and large bodies that a run has changed by `dem.model.changes.change`.
@@ -84,7 +88,7 @@ class World:
 
     def take(self, trial: World) -> None:
         """Take the state to which a step has brought a trial."""
-        vars(self).update({name: vars(trial)[name] for name in STATE})
+        vars(self).update(zip(STATE, _state_of(trial)))
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Arrays from which `dem.start.restored_world` makes this world again: rows of local grains, and replicated
@@ -98,6 +102,7 @@ class World:
     def set_grains(self, grains: Bodies) -> None:
         """Replace the slab of this rank; collective."""
         self.grains, self.lists = grains, None
+        self.owned = len(grains) + (len(self.large) if self.comm.rank == self.comm.size - 1 else 0)
         everyone, balls = np.zeros((self.comm.size + 1, 2), np.int64), np.count_nonzero(grains.shape == bodies.SPHERE)
         self.comm.Allgather(np.array([len(grains), balls], np.int64), everyone[1:])
         self.slabs = np.cumsum(everyone[:, 0])
@@ -115,11 +120,6 @@ class World:
     def body_count(self) -> int:
         """Number of bodies on all ranks."""
         return int(self.slabs[-1]) + len(self.large)
-
-    @property
-    def owned(self) -> int:
-        """Number of bodies whose rows this rank owns: its grains, and on the last rank the large bodies."""
-        return len(self.grains) + (len(self.large) if self.comm.rank == self.comm.size - 1 else 0)
 
     @property
     def turns_unlike_spheres(self) -> bool:

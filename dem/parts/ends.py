@@ -111,6 +111,11 @@ class Ends(NamedTuple):
     quaternion: Floats  #: (n, 4)
     velocity: Floats  #: (n, 6) before the step
     free: Floats  #: (n, 6) after the step, without contacts, drives and what is not yet applied [m/s, rad/s]
-    inverse_mass: Floats  #: (n, 6, 6)
+    root: Floats  #: (n, 6, 6) M^-1/2
     moments: Floats  #: (n, 3) principal moments of inertia, inf: it does not turn freely [kg m^2]
     spin_change: Floats  #: (n, 3) what is applied changes of the angular velocities in `free` [rad/s]
+
+    @property
+    def inverse_mass(self) -> Floats:
+        """(n, 6, 6)"""
+        return self.root @ self.root

@@ -14,6 +14,8 @@ import numpy as np
 
 from dem import checks, quaternion
 from dem.arrays import Floats, Ints
+from dem.compiled import inlined, loop
+from dem.geometry import vectors
 from dem.motion import Driven
 from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Condition, Constraint, End, Geometry, Place
 from dem.parts.named import Pressing
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 def axes_of(frame: Floats) -> Floats:
     """The axes (n, 3, 3) of frames of quaternions (n, 4), as rows in the world."""
-    return quaternion.rotate(frame[:, None], np.eye(3))
+    return quaternion.matrix(frame).transpose(0, 2, 1)
 
 
 def turned(one: Floats, other: Floats, relative: Floats) -> tuple[Floats, Floats]:
@@ -50,6 +52,34 @@ def turned_about_pins(one: Floats, other: Floats, relative: Floats) -> tuple[Flo
     between = -np.arcsin(np.clip(turn[:, 2, 0], -1.0, 1.0))
     angles = np.stack([np.arctan2(turn[:, 2, 1], turn[:, 2, 2]), between, angle], axis=1)
     return quaternion.multiply(one, about), angles
+
+
+@loop
+def sides(orientation: Floats, anchors: Floats, frames: Floats) -> tuple[Floats, Floats, Floats]:
+    """Of joints with anchors (n, 2, 3) and frames (n, 2, 4) in bodies of these orientations (n, 2, 4) the arms
+    (n, 2, 3), the frames (n, 2, 4) in the world, and the turns (n, 4) from the first to the second."""
+    arms, turns, relative = np.empty(anchors.shape), np.empty(frames.shape), np.empty((len(frames), 4))
+    for n in range(len(frames)):
+        for k in range(2):
+            q, at = orientation[n, k], anchors[n, k]
+            arm = vectors.turned((at[0], at[1], at[2]), (q[1], q[2], q[3]), 2.0 * q[0], 2.0)
+            arms[n, k, 0], arms[n, k, 1], arms[n, k, 2] = arm
+            _set_product(q, 1.0, frames[n, k], turns[n, k])
+        _set_product(turns[n, 0], -1.0, turns[n, 1], relative[n])
+        if relative[n, 0] < 0.0:
+            for k in range(4):
+                relative[n, k] = -relative[n, k]
+    return arms, turns, relative
+
+
+@inlined
+def _set_product(p, sign, q, out):
+    """The product of two quaternions, of the first or its inverse (sign -1), of unit norm."""
+    a, b, c, d = p[0], sign * p[1], sign * p[2], sign * p[3]
+    w, x = a * q[0] - b * q[1] - c * q[2] - d * q[3], a * q[1] + b * q[0] + c * q[3] - d * q[2]
+    y, z = a * q[2] + c * q[0] + d * q[1] - b * q[3], a * q[3] + d * q[0] + b * q[2] - c * q[1]
+    size = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
+    out[0], out[1], out[2], out[3] = size * w, size * x, size * y, size * z
 
 
 class Kind(NamedTuple):
@@ -180,8 +210,8 @@ class Joint(Constraint):
 
     def conditions(self, error: Floats, dt: float) -> list[Condition]:
         at = error[self.coordinate]
-        holds = np.flatnonzero(KINDS[self.kind].holds).tolist()
-        found = [Condition(coordinate, HELD, -error[coordinate] / dt) for coordinate in holds]
+        holds = enumerate(KINDS[self.kind].holds)
+        found = [Condition(coordinate, HELD, -error[coordinate] / dt) for coordinate, held in holds if held]
         if self.driven:
             way = np.inf if self.target is None else min(max(self.target, self.low), self.high) - at
             most = np.inf if self.speed is None else self.speed
@@ -198,11 +228,8 @@ class Joint(Constraint):
         of_kind = [(KINDS[kind], (kinds == kind).nonzero()[0]) for kind in dict.fromkeys(kinds.tolist())]
 
         def now(position: Floats, orientation: Floats) -> Geometry:
-            center, turn = position[row], orientation[row]
-            place, turn = center + quaternion.rotate(turn, anchors), quaternion.multiply(turn, frames)
-            turn = quaternion.normalized(turn)
-            relative = quaternion.multiply(quaternion.conjugate(turn[:, 0]), turn[:, 1])
-            relative = np.where(relative[:, :1] < 0.0, -relative, relative)
+            center, (arms, turn, relative) = position[row], sides(orientation[row], anchors, frames)
+            place = center + arms
             frame, turns = np.empty((len(row), 4)), np.empty((len(row), 3))
             for kind, own in of_kind:
                 frame[own], turns[own] = kind.turned(turn[own, 0], turn[own, 1], relative[own])

@@ -292,7 +292,8 @@ def _constraint_works(step: Step, before: Floats, mean: Floats) -> tuple[float, 
     system, world = step.system, step.world
     if system.coupling is None:
         return 0.0, 0.0
-    push = np.einsum("k,knx->nx", step.constraint_impulses, system.coupling.rows)
+    rows = system.coupling.rows
+    push = (step.constraint_impulses @ rows.reshape(len(rows), -1)).reshape(rows.shape[1:])
     here, slot = slots(world, world.grains.id)
     velocity = world.grains.velocity[here]
     works = np.array([0.5 * np.vdot(push[slot], before[here] + velocity), np.vdot(push[slot], velocity)])

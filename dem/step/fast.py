@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from dem import bodies
 from dem.arrays import Bools, Floats, places
 from dem.bodies import SPHERE
 from dem.compiled import loop
@@ -37,7 +36,7 @@ def refuse_passages(
     first search tells.
     """
     grains, dt = world.grains, free.dt
-    most = FAR * bodies.bounding_radius(grains)
+    most = FAR * contacts.lists.table.radius[: len(grains)]
     here, own = beyond(velocity, most, dt)
     if not on_any(world.comm, here > 0)[0]:
         return

@@ -63,7 +63,8 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     faster than `slowest`; without restitution those of two that are near no other. Two spheres that pass each
     other have no contact that closes. In cells that deform, and where bodies attract each other, nothing is
     followed."""
-    touched, contacts = contacts.touched, replace(contacts, touched=None)
+    touched = contacts.touched
+    contacts = contacts if touched is None else replace(contacts, touched=None)
     if world.cell.moves or world.pairs.attracts or not world.any_spheres:
         return contacts
     near, table, pairs, dt = contacts.near, contacts.near.bodies, world.pairs, motion.dt
@@ -74,7 +75,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         ball[slots(world, table.id)[0]] = False
     image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     radius = np.ascontiguousarray(table.size[:, 0])
-    surface, slow = np.zeros((0, 3)), np.full(len(contacts), dt * math.hypot(*world.gravity))
+    surface, slow = np.zeros((0, 3)), np.zeros(len(contacts)) + dt * math.hypot(*world.gravity)
     if pairs.bounces:
         old = old.copy()
         old[grains:] = motion.prescribed
@@ -86,12 +87,12 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         contacts = _where_they_touch(world, contacts, touched, motion.prescribed, (ball, radius, slow))
     if pairs.bounces:
         surface = _surfaces(contacts, old)
-    kind, bounce, offset, marked = struck(
+    kind, bounce, offset, marked, some = struck(
         (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
         (ball, table.mass, radius, table.material), (table.position, old, surface),
         (pairs.restitution, pairs.stiffness), grains, image, dt, slow,
     )  # fmt: skip
-    if not on_any(world.comm, bool(marked.any()))[0]:
+    if not on_any(world.comm, some)[0]:
         return contacts
     rows = np.stack([contacts.a, contacts.b], axis=1)
     chosen = np.flatnonzero(_reached(world, contacts, rows, kind, marked)[rows].any(axis=1))
@@ -203,11 +204,12 @@ def _reached(world: World, contacts: Contacts, rows: Ints, kind: Ints, marked: B
 def struck(
     contacts: Touching, linear: Floats, spheres: Spheres, motions: tuple[Floats, Floats, Floats],
     laws: tuple[Floats, Floats], grains: int, image: Floats, dt: float, slow: Floats,
-) -> tuple[Ints, Floats, Floats, Bools]:  # fmt: skip
+) -> tuple[Ints, Floats, Floats, Bools, bool]:  # fmt: skip
     """Of contacts (nc,) the kinds (nc,), the coefficients of restitution (nc,)
     and the ways from the second bodies to their images (nc, 3), of spheres `image`; and which bodies (rows,) meet by
     the velocities before the step, of second ones in their contacts the third of `motions` (nc, 3), faster than `slow`
-    (nc,), or pass each other while the linear gap closes. Those that press others that they touch are left out."""
+    (nc,), or pass each other while the linear gap closes, and whether any do. Those that press others that they touch
+    are left out."""
     (one, two, normal, gap), (ball, mass, radius, material) = contacts, spheres
     (place, velocity, surface), (restitution, stiffness) = motions, laws
     count = len(one)
@@ -249,7 +251,7 @@ def struck(
         elif kind[c] == PAIR:
             free = not (presses[a] or presses[b]) if meets[c] else passes[c] and not (touches[a] or touches[b])
             marked[a], marked[b] = marked[a] or free, marked[b] or free
-    return kind, bounce, offset, marked
+    return kind, bounce, offset, marked, bool(marked.any())
 
 
 @loop

@@ -19,6 +19,7 @@ from dem.bodies import BOX, CONVEX, POLYHEDRON
 from dem.compiled import loop
 from dem.exchange import on_any
 from dem.model.world import World
+from dem.quaternion import length
 from dem.shapes import Capsule, Convex, Sphere
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def landing(
     if world.only_spheres and not world.large_moves:
         return None
     table, gap = contacts.near.bodies, contacts.linear_gap
-    push = np.linalg.norm(free[:, :3] - table.velocity[:, :3], axis=1)
+    push = length(free[:, :3] - table.velocity[:, :3])
     corners = _with_corners(world, contacts.near)
     body, bears = _bearing(contacts.a, contacts.b, (table.mass, push), corners, gap, freely, last, dt)
     if not on_any(contact_map.comm, bool(bears.any()))[0]:

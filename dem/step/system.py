@@ -383,7 +383,7 @@ class ContactSystem:
         known, coupling, saturated = self.motion, None, None
         if self.coupling is not None and self.coupling.decides:
             coupling = coupling_refound(world, self.coupling, self._push(*self.parts(impulse)))
-        if self.drives.bound.any():
+        if world.large_moves and self.drives.bound.any():
             large = large_velocity(world, known, velocity)
             saturated = self.drives.refound(self.drive_impulse(large), large)
         if coupling is None and saturated is None:

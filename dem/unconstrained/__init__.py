@@ -104,6 +104,6 @@ def free_velocities(
     given = np.zeros((owned, 3))
     if pushed is not None:
         given[: near.grains] = pushed[:, 3:]
-    if owned > near.grains and free.drives.impulse.any():  # of the last rank, which has no ghosts
+    if world.large_moves and owned > near.grains and free.drives.impulse.any():  # of the last rank, which has no ghosts
         given[near.grains :] = velocity_changes(world.large, free.drives.impulse)[:, 3:]
     return velocity, spin_freely(table, velocity, given, change, free.dt)

@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from dem import bodies
 from dem.arrays import Floats, Ints
+from dem.compiled import loop
 from dem.free_motion import free_velocity, velocity_changes
 from dem.model.world import World
 from dem.parts.ends import End, Ends, Tie
@@ -36,9 +37,8 @@ class Applied:
 
     def add(self, world: World, ends: Ends, impulse: Floats) -> None:
         """Add impulses (n, 6) on these bodies; no force moves large bodies of prescribed motion."""
-        first = len(ends.ids)
-        here = np.flatnonzero(np.isin(world.grains.id, ends.ids))
-        self.grains[here] += impulse[np.searchsorted(ends.ids, world.grains.id[here])]
+        first, (here, slot) = len(ends.ids), slots_of(ends.ids, world.first_large, world.grains.id)
+        self.grains[here] += impulse[slot]
         self.large[:] += np.where(bodies.is_dynamic(world.large)[:, None], impulse[first:-1], 0.0)
 
 
@@ -71,6 +71,19 @@ def _rows_of(ends: tuple[tuple[End, End], ...], large: tuple[str, ...]) -> tuple
     return np.array(grains, np.int64), np.array([[row[end] for end in pair] for pair in ends]).reshape(-1, 2)
 
 
+@loop
+def slots_of(ids: Ints, first: int, id: Ints) -> tuple[Ints, Ints]:
+    """Which rows of bodies with the ids `id` (n,) are among the grains of `ids`, in order, and the large bodies, whose
+    ids begin with the `first`; and their rows there."""
+    here, slot, found = np.empty(len(id), np.int64), np.empty(len(id), np.int64), 0
+    for n in range(len(id)):
+        at = len(ids) + id[n] - first if id[n] >= first else np.searchsorted(ids, id[n])
+        if id[n] >= first or (at < len(ids) and ids[at] == id[n]):
+            here[found], slot[found] = n, at
+            found += 1
+    return here[:found].copy(), slot[:found].copy()
+
+
 COLUMNS = (0, 3, 7, 13, 19, 20, 29, 32, 35)  #: where what ranks tell of the grains at ends begins
 
 
@@ -79,25 +92,24 @@ def ends_of(
 ) -> Ends:
     """The bodies at the ends of parts, with impulses (grains, 6) and (large, 6); collective."""
     ids, row = rows_of(world, parts)
-    here = np.flatnonzero(np.isin(world.grains.id, ids))
+    here, slot = slots_of(ids, world.first_large, world.grains.id)
     own = world.grains.take(here)
     change = velocity_changes(own, grains[here])
     free = free_velocity(own, world.gravity, dt) + change
-    root = bodies.inverse_root_inertia(own)
-    state = own.position, own.quaternion, own.velocity, free, 1.0 / own.mass[:, None], (root @ root).reshape(-1, 9)
+    light, turning = 1.0 / np.sqrt(own.mass)[:, None], bodies.inverse_root_inertia(own).reshape(-1, 9)
+    state = own.position, own.quaternion, own.velocity, free, light, turning, own.inertia, change[:, 3:]
     gathered = np.zeros((len(ids), 35))
-    gathered[np.searchsorted(ids, own.id)] = np.concatenate([*state, own.inertia, change[:, 3:]], axis=1)
+    gathered[slot] = np.concatenate(state, axis=1)
     world.comm.Allreduce(MPI.IN_PLACE, gathered)  # each row is that of one rank
     columns = [gathered[:, first:end] for first, end in zip(COLUMNS, COLUMNS[1:])]
-    position, turn, velocity, free, light, inverse_inertia, moments, pushes = columns
+    position, turn, velocity, free, light, turning, moments, pushes = columns
     tools = world.large
     change = velocity_changes(tools, large)
     pushed = free_velocity(tools, world.gravity, dt) + change
-    root = bodies.inverse_root_inertia(tools)
-    translation = free_directions(world.large_bodies) / tools.mass[:, None, None]
-    inverse = np.zeros((len(ids) + len(tools) + 1, 6, 6))
-    inverse[:, :3, :3] = np.concatenate([light[:, :, None] * np.eye(3), translation, np.zeros((1, 3, 3))])
-    inverse[:, 3:, 3:] = np.concatenate([inverse_inertia.reshape(-1, 3, 3), root @ root, np.zeros((1, 3, 3))])
+    root, first = np.zeros((len(ids) + len(tools) + 1, 6, 6)), len(ids)
+    root[:first, [0, 1, 2], [0, 1, 2]], root[:first, 3:, 3:] = light, turning.reshape(-1, 3, 3)
+    root[first:-1, :3, :3] = free_directions(world.large_bodies) / np.sqrt(tools.mass)[:, None, None]
+    root[first:-1, 3:, 3:] = bodies.inverse_root_inertia(tools)
     return Ends(
         ids,
         row,
@@ -105,7 +117,7 @@ def ends_of(
         np.concatenate([turn, tools.quaternion, [[1.0, 0.0, 0.0, 0.0]]]),
         np.concatenate([velocity, tools.velocity, np.zeros((1, 6))]),
         np.concatenate([free, as_motions_allow(world, pushed, motion_velocities), np.zeros((1, 6))]),
-        inverse,
+        root,
         np.concatenate([moments, tools.inertia, np.full((1, 3), np.inf)]),
         np.concatenate([pushes, change[:, 3:], np.zeros((1, 3))]),
     )

@@ -23,7 +23,6 @@ from mpi4py import MPI
 
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
-from dem.compiled import loop
 from dem.exchange import broadcast
 from dem.free_motion import free_spin, unequal
 from dem.model.world import World
@@ -31,7 +30,7 @@ from dem.motion import DROOP
 from dem.parts.cell import Cell
 from dem.parts.ends import HELD, LOWER, MOTOR, UPPER, Constraint, Ends, Geometry, Place
 from dem.scene import kinds_of
-from dem.unconstrained.applied import Applied, ends_of, rows_of
+from dem.unconstrained.applied import Applied, ends_of, rows_of, slots_of
 
 Kinds = Sequence[tuple[type[Constraint], Sequence[Constraint]]]
 
@@ -102,9 +101,9 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     which, coordinates, kind, t, bound, way = (np.array(column) for column in zip(*asked))
     J, along = np.zeros((len(t), count, 6)), found.rows
     for side in (0, 1):
-        np.add.at(J, (np.arange(len(t)), row[which, side]), along[which, coordinates, side])
-    root = _roots(ends.inverse_mass)
-    B = np.einsum("knx,nxy->kny", J, root).reshape(len(t), -1)
+        J[np.arange(len(t)), row[which, side]] += along[which, coordinates, side]
+    root = ends.root
+    B = np.matmul(J[:, :, None], root).reshape(len(t), -1)
     A, held, flat = B @ B.T, kind == HELD, J.reshape(len(t), -1)
     now = flat @ ends.velocity.ravel()
     left = _braked(A, t, bound, np.abs(way), held, now, flat @ ends.free.ravel(), dt)
@@ -112,34 +111,35 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     motors = np.isfinite(bound)
     slip[motors] = np.maximum(slip, 1e-9 * np.diag(A) * np.where(motors, bound, 0.0))[motors]
     slip = np.copysign(slip, left - now)
-    on, saturated = kind <= MOTOR, np.zeros(len(t))
+    on, saturated, decides = kind <= MOTOR, np.zeros(len(t)), motors.any() or (kind > MOTOR).any()
+    inverse = _inverse(A, on)
     rows = unequal(ends.moments).nonzero()[0]
     known = ends.quaternion[rows], ends.velocity[rows, 3:], ends.moments[rows]
     t, least, expected, pushed = left.copy(), np.inf, push.ravel(), B @ push.ravel()
     for number in range(ROUNDS):
         velocity, (spin, middle) = ends.free.copy(), np.full((2, count, 3), np.nan)
-        change = np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
+        change = _changes(root, expected)
         spun, middle[rows] = free_spin(*known, dt, change[rows, 3:] + ends.spin_change[rows])
         spin[rows] = velocity[rows, 3:] = spun + ends.spin_change[rows]
         free = flat @ velocity.ravel()
         for _ in range(2 * len(t) + 1):
-            g = _impulses(A, t, free, on, saturated)
-            wrong = _wrong(kind, t, bound, on, g, free + A @ g, 0.0)
-            if not wrong.any():
+            g = _impulses(A, inverse, t, free, on, saturated)
+            if not decides or not (wrong := _wrong(kind, t, bound, on, g, free + A @ g, 0.0)).any():
                 break
             on, saturated = _turned(kind, bound, on, saturated, g, wrong)
+            inverse = _inverse(A, on)
         last, expected = expected, B.T @ g
         if pushed.any():
-            expected = push.ravel() + B.T @ _impulses(A, t, free + pushed, on, saturated)
+            expected = push.ravel() + B.T @ _impulses(A, inverse, t, free + pushed, on, saturated)
         differs = np.abs(expected - last).max()
         if number and differs >= least:
             break
-        best = t, free, on, saturated, spin, middle
+        best = t, free, on, saturated, inverse, spin, middle
         if number:
             least = differs
         if least <= 1e-7 * np.abs(expected).max():
             break
-        after = velocity + np.einsum("nxy,ny->nx", root, expected.reshape(-1, 6))
+        after = velocity + _changes(root, expected)
         if dt * np.abs(after[:, 3:]).max(initial=0.0) > FAR:
             best = left, *best[1:]
             break
@@ -147,9 +147,9 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
         error = geometry(place, turn).error
         bent = (error - found.error)[which, coordinates] / dt - flat @ after.ravel()
         t = np.where(held, left - bent, left)
-    t, free, on, saturated, spin, middle = best
+    t, free, on, saturated, inverse, spin, middle = best
     fixed = (J, B, root, which, coordinates, kind, t, bound, free, slip, found.axes)
-    solved = _solved(B, root, t, bound, free, slip, on, saturated)
+    solved = _solved(B, root, t, bound, free, slip, on, saturated, inverse)
     return Coupling(*fixed, on, saturated, *solved, spin=spin, middle=middle)
 
 
@@ -182,17 +182,26 @@ def refound(known: Coupling, push: Floats) -> Coupling | None:
         return None
     on, saturated = _turned(known.kind, known.bound, known.on, known.saturated, g, wrong)
     numbers = known.target, known.bound, known.free, known.slip
-    solver, impulse, change, matrix = _solved(known.scaled, known.root, *numbers, on, saturated)
+    inverse = _inverse(known.scaled @ known.scaled.T, on)
+    solver, impulse, change, matrix = _solved(known.scaled, known.root, *numbers, on, saturated, inverse)
     return dataclasses.replace(
         known, on=on, saturated=saturated, solver=solver, impulse=impulse, change=change, matrix=matrix
     )
 
 
-def _impulses(A: Floats, t: Floats, free: Floats, on: Bools, saturated: Floats) -> Floats:
-    """Impulses (k,) that bring the rows that hold to t; of the others those that saturate them."""
-    g = saturated.copy()
-    g[on] = np.linalg.lstsq(A[on][:, on], (t - free - A @ saturated)[on], rcond=1e-12)[0]
-    return g
+def _inverse(A: Floats, on: Bools) -> Floats:
+    """The pseudo-inverse (k, k) of the symmetric A of the rows that hold, zero in the others."""
+    value, vector = np.linalg.eigh(A * (on[:, None] & on))
+    size = np.abs(value)
+    kept = size > 1e-12 * size.max(initial=0.0)
+    vector = vector[:, kept] * on[:, None]
+    return (vector / value[kept]) @ vector.T
+
+
+def _impulses(A: Floats, inverse: Floats, t: Floats, free: Floats, on: Bools, saturated: Floats) -> Floats:
+    """Impulses (k,) that bring the rows that hold to t, with the `_inverse` of A; of the others those that saturate
+    them."""
+    return np.where(on, inverse @ (t - free - A @ saturated), saturated)
 
 
 def _wrong(kind: Ints, t: Floats, bound: Floats, on: Bools, g: Floats, after: Floats, loose: float) -> Bools:
@@ -217,27 +226,27 @@ def _turned(kind: Ints, bound: Floats, on: Bools, saturated: Floats, g: Floats, 
 
 
 def _solved(
-    B: Floats, root: Floats, t: Floats, bound: Floats, free: Floats, slip: Floats, on: Bools, saturated: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """`solver`, `impulse`, `change` and `matrix` of a `Coupling`."""
+    B: Floats, root: Floats, t: Floats, bound: Floats, free: Floats, slip: Floats, on: Bools, saturated: Floats,
+    inverse: Floats,
+) -> tuple[Floats, Floats, Floats, Floats]:  # fmt: skip
+    """`solver`, `impulse`, `change` and `matrix` of a `Coupling`, with the `_inverse` of B B' of the rows that hold."""
     A = B @ B.T
-    g = _impulses(A, t, free, on, saturated)
+    g = _impulses(A, inverse, t, free, on, saturated)
     # Beyond what motors give without contacts; not positive where only these bring one to its speed: it is held there.
     room = bound - np.copysign(g, g * slip)
     yields = np.isfinite(bound) & (room > 0.0)
     e = np.divide(np.abs(slip), room, out=np.zeros(slip.shape), where=yields)
-    solver = np.zeros(A.shape)
-    solver[np.ix_(on, on)] = np.linalg.pinv(A[on][:, on] + np.diag(e[on]), rcond=1e-12, hermitian=True)
-    value, vector = np.linalg.eigh(B.T @ solver @ B)
-    K = (vector * (1.0 - np.sqrt(np.clip(1.0 - value, 0.0, 1.0)))) @ vector.T
-    change = np.einsum("nxy,ny->nx", root, (B.T @ g).reshape(-1, 6))
-    return solver, g, change, K
+    solver = _inverse(A + np.diag(e), on) if yields.any() else inverse
+    K = B.T @ solver @ B
+    if yields.any():  # else it is a projector, and I - K its own root
+        value, vector = np.linalg.eigh(K)
+        K = (vector * (1.0 - np.sqrt(np.clip(1.0 - value, 0.0, 1.0)))) @ vector.T
+    return solver, g, _changes(root, B.T @ g), K
 
 
-def _roots(matrix: Floats) -> Floats:
-    """Symmetric roots of symmetric matrices (n, 6, 6)."""
-    value, vector = np.linalg.eigh(matrix)
-    return (vector * np.sqrt(np.maximum(value, 0.0))[:, None]) @ vector.transpose(0, 2, 1)
+def _changes(root: Floats, momenta: Floats) -> Floats:
+    """What mass-scaled momenta (6 n,) change of velocities (n, 6), with the roots (n, 6, 6) of M^-1."""
+    return (root @ momenta.reshape(-1, 6, 1))[:, :, 0]
 
 
 def constrained(world: World) -> tuple[Ints, Ints]:
@@ -281,18 +290,7 @@ def coupling_refound(world: World, known: Coupling, push: Floats) -> Coupling | 
 
 def slots(world: World, id: Ints) -> tuple[Ints, Ints]:
     """Which rows of bodies with these ids (n,) are among the bodies that constraints know, and their rows there."""
-    return _slots(constrained(world)[0], world.first_large, id)
-
-
-@loop
-def _slots(ids: Ints, first: int, id: Ints) -> tuple[Ints, Ints]:
-    here, slot, found = np.empty(len(id), np.int64), np.empty(len(id), np.int64), 0
-    for n in range(len(id)):
-        at = len(ids) + id[n] - first if id[n] >= first else np.searchsorted(ids, id[n])
-        if id[n] >= first or (at < len(ids) and ids[at] == id[n]):
-            here[found], slot[found] = n, at
-            found += 1
-    return here[:found].copy(), slot[:found].copy()
+    return slots_of(constrained(world)[0], world.first_large, id)
 
 
 def number_of(world: World, kind: str, name: str) -> int:
@@ -304,9 +302,9 @@ def number_of(world: World, kind: str, name: str) -> int:
 def constraints_now(world: World) -> tuple[Geometry, Floats]:
     """The constraints as they are, and the velocities (constraints, 2, 6) of their ends; collective."""
     (ids, row), grains, large = constrained(world), world.grains, world.large
-    here = np.flatnonzero(np.isin(grains.id, ids))
+    here, slot = slots_of(ids, world.first_large, grains.id)
     own, gathered = grains.take(here), np.zeros((len(ids), 13))
-    gathered[np.searchsorted(ids, own.id)] = np.concatenate([own.position, own.quaternion, own.velocity], axis=1)
+    gathered[slot] = np.concatenate([own.position, own.quaternion, own.velocity], axis=1)
     world.comm.Allreduce(MPI.IN_PLACE, gathered)  # each row is that of one rank
     tools = np.concatenate([large.position, large.quaternion, large.velocity], axis=1)
     rest = np.concatenate([np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], np.zeros((1, 6))], axis=1)

@@ -56,6 +56,8 @@ __all__ = [
     "measure",
     "newton_for",
     "solve",
+    "solved",
+    "watched",
     "with_part",
 ]
 
@@ -99,12 +101,29 @@ def solve(
     if not problem.has_entries and SOLVERS[type].needs == MATRIX:
         allowed = ", ".join(name for name, method in SOLVERS.items() if method.needs != MATRIX)
         raise ValueError(f"the solver {type!r} reads rows of N, but N is given by its products; allowed are {allowed}")
-    limits = instance(Limits, "limits", limits)
+    limits = watched(problem.comm, instance(Limits, "limits", limits), monitor)
     options = instance(SOLVERS[type].options, "options", options, f" for {type}")
-    if monitor is not None or limits.monitor:
-        watch = monitor or partial(_print, problem.comm)
-        limits = dataclasses.replace(limits, watch=lambda *at: on_each(problem.comm, "monitor", lambda: watch(*at)))
     start = problem.taken("a guess", problem.shown(np.zeros(problem.r.shape)) if guess is None else guess, finite=True)
+    result = solved(problem, start, type, limits, options, newton, law)
+    for each in (result,) if result.asked is None else (result, result.asked):
+        _tell_states(problem, each)
+        each.impulse = problem.shown(each.impulse)
+    return result
+
+
+def watched(comm: MPI.Comm, limits: Limits, monitor: Callable[[int, float], None] | None = None) -> Limits:
+    """The limits with a ``watch`` that calls a monitor, or prints, where either is asked for."""
+    if monitor is None and not limits.monitor:
+        return limits
+    watch = monitor or partial(_print, comm)
+    return limits.but(watch=lambda *at: on_each(comm, "monitor", lambda: watch(*at)))
+
+
+def solved(
+    problem: ConeProblem, start: Array, type: str, limits: Limits, options: Any, newton: Newton | None, law: str
+) -> Result:
+    """The same from impulses in the cones (nc, 3), by settings that are checked already, without velocities and states
+    of the contacts: a step has no use for them."""
     result = asked = _by(type, problem, start, limits, options, newton, law)
     other = "conic" if asked.solver == "apgd" else "apgd"
     wrong = asked.status is Status.BREAKDOWN and other == "conic"  # products are no numbers
@@ -117,8 +136,6 @@ def solve(
         better = second.final or doubtful or second.residual < asked.residual
         result = second.after(asked) if better else dataclasses.replace(asked).after(second)
         result.asked, result.reason = asked, f"{type}: {asked.reason}; {other}: {second.reason}"
-    for each in (result,) if result.asked is None else (result, result.asked):
-        each.impulse = problem.shown(each.impulse)
     return result
 
 
@@ -186,18 +203,19 @@ def _by(
 
 
 def _measure(problem: ConeProblem, result: Result) -> Accuracy:
-    """Tell the result what its impulses do to the bodies and the contacts, and how accurate they are."""
+    """Tell the result what its impulses do to the bodies, and how accurate they are."""
     result.momentum = problem.momentum(result.impulse)
-    rigid = problem.velocity_of(result.momentum)
-    y = rigid + problem.r
-    if problem.yields:
-        y += problem.compliance * result.impulse
+    result.accuracy = figures(problem, result.impulse, problem.velocity_of(result.momentum))
+    return result.accuracy
+
+
+def _tell_states(problem: ConeProblem, result: Result) -> None:
+    """Tell the result what the contacts do; collective."""
+    y = problem.velocity_of(result.momentum) + problem.r + problem.compliance * result.impulse
     result.velocity = y if problem.units is None else problem.velocities_by(result.impulse)
     terms = problem.cones.de_saxce(y) if result.law == RELAXATION else np.zeros(0)
     result.states, here = states(result.impulse, y, problem.diagonal, problem.mu, terms)
     result.counts = Counts(*map(int, problem.sums(*here)))
-    result.accuracy = figures(problem, result.impulse, rigid)
-    return result.accuracy
 
 
 @loop

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from dem.compiled import loop
-from dem.contact_map import BlockRows
+from dem.contact_map import BlockRows, ContactMap
 from dem.exchange import reduced, refuse
 from pctt.arrays import TINY, Array, all_from
 from pctt.ccp import door
@@ -97,16 +97,33 @@ class ConeProblem:
     ):
         data = {"N": N, "G": G, "masses": masses, "point": point, "key": key, "compliance": compliance}
         contacts = door.contacts_of(comm, r, mu, cones, **data)
-        self.units, self._width = contacts.units, contacts.width
-        self.r, self.mu, self._given_r = contacts.r, contacts.mu, contacts.given_r
-        self.cones = FrictionCones(self.mu) if cones is None else cones
-        self.comm, self.key = comm, key
+        operator = door.operator_of(comm, len(contacts.r), contacts.width, N, G, masses)
+        cones = FrictionCones(contacts.mu) if cones is None else cones
+        self._begin(comm, contacts, cones, operator, point, key, compliance)
+
+    @classmethod
+    def of_bodies(
+        cls, comm: MPI.Comm, r: Array, cones: Cones, G: ContactMap, point: Array | None, key: np.ndarray | None,
+        compliance: Array,
+    ) -> ConeProblem:  # fmt: skip
+        """The same of a program's own contacts, whose arrays fit and need no check; ``compliance`` (nc, 3).
+        Collective."""
+        problem, G.log_flops = object.__new__(cls), PETSc.Log.logFlops
+        problem._begin(comm, door.Contacts(3, None, r, cones.mu, r), cones, G, point, key, compliance)
+        return problem
+
+    def _begin(
+        self, comm: MPI.Comm, contacts: door.Contacts, cones: Cones, operator: ContactMap | GivenOperator,
+        point: Array | None, key: np.ndarray | None, compliance: Array | float,
+    ) -> None:  # fmt: skip
+        self.units, self._width, self._given_r = contacts.units, contacts.width, contacts.given_r
+        self.comm, self.r, self.mu, self.cones, self.key = comm, contacts.r, contacts.mu, cones, key
         self._curvature: list[float] = []  # shared with problems of other r
-        self.point = point if point is None or self.cones.parts == 1 else np.concatenate([point] * self.cones.parts)
-        self.compliance = compliances(compliance, self.cones.count, len(self.r))
-        self.operator = self._given_operator = door.operator_of(comm, len(self.r), contacts.width, N, G, masses)
+        self.point = point if point is None or cones.parts == 1 else np.concatenate([point] * cones.parts)
+        self.compliance = compliances(compliance, cones.count, len(self.r))
+        self.operator = self._given_operator = operator
         if self.units is not None:
-            self.operator = door.in_units(comm, self._given_operator, self.units)
+            self.operator = door.in_units(comm, operator, self.units)
         self.contact_map = None if isinstance(self.operator, GivenOperator) else self.operator
         blocks = self.operator.contact_blocks()  # not kept: few methods take more of them than their diagonals
         trace = float(_diagonals(blocks).sum())  # has squares of all numbers of G
@@ -150,11 +167,11 @@ class ConeProblem:
         Collective."""
         assert self.contact_map is not None
         rows = self.cones.rows_of(contacts)
-        return ConeProblem(
-            self.comm, self.r[rows], cones=self.cones.only(contacts), G=self.contact_map.part(contacts),
-            point=None if self.point is None else self.point[contacts],
-            key=None if self.key is None else self.key[contacts], compliance=self.compliance[contacts],
-        )  # fmt: skip
+        return ConeProblem.of_bodies(
+            self.comm, self.r[rows], self.cones.only(contacts), self.contact_map.part(contacts),
+            None if self.point is None else self.point[contacts], None if self.key is None else self.key[contacts],
+            self.compliance[contacts],
+        )
 
     # -- the user's units ------------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple, Optional
 
 import numpy as np
@@ -107,14 +108,18 @@ class Limits:
     @property
     def met(self) -> str:
         """The reason of a result that meets them."""
-        others = {"closing work": self.closing_work, "closing speed": self.closing_speed}
-        names = ["natural residual", *(name for name, limit in others.items() if limit < math.inf)]
-        return " and ".join([", ".join(names[:-1]), names[-1]][len(names) < 2 :]) + " below the tolerance"
+        return _met(self.closing_work < math.inf, self.closing_speed < math.inf)
 
     def to(self, tol: float) -> Limits:
         """For another tolerance of the same residual, and no aim beyond it."""
         work, speed = (limit / self.tol * tol for limit in (self.closing_work, self.closing_speed))
         return dataclasses.replace(self, tol=tol, closing_work=work, closing_speed=speed, aim=1.0)
+
+
+@cache
+def _met(work: bool, speed: bool) -> str:
+    names = ["natural residual", *["closing work"] * work, *["closing speed"] * speed]
+    return " and ".join([", ".join(names[:-1]), names[-1]][len(names) < 2 :]) + " below the tolerance"
 
 
 class Status(Enum):

@@ -58,7 +58,7 @@ def with_islands(
 ) -> Result:
     """The result ``found`` by limits without an aim, with impulses of islands at rest that meet the aim: a part of the
     problem, to which ``solve`` is applied. Collective."""
-    if limits.aim < 1.0 or not found.converged:
+    if limits.aim < 1.0 or not found.converged or not problem.size:
         return found
     contacts, part = contacts_at_rest(world, system, _passing(world, system), SLOW)
     (count,), (part,) = reduced(world.comm, (len(contacts),), (part,))

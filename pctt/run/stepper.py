@@ -79,7 +79,7 @@ class Stepper:
 
     def use(self, settings: Settings) -> None:
         """Make the next steps by these settings."""
-        self.settings, self._limits = settings, settings.limits
+        self.settings, self._limits = settings, ccp.watched(self.world.comm, settings.limits)
 
     def __enter__(self) -> Stepper:
         return self
@@ -198,7 +198,7 @@ class Stepper:
     ) -> ccp.Result:
         """What the method of the settings makes of a problem."""
         settings = self.settings
-        return ccp.solve(problem, guess, settings.solver, limits, settings.options, newton, settings.law)
+        return ccp.solved(problem, guess, settings.solver, limits, settings.options, newton, settings.law)
 
     def _by_itself(self, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits) -> ccp.Result:
         """The same of a part of the problem of a step."""
@@ -295,12 +295,12 @@ def _refuse_squeezed(world: World, result: ccp.Result) -> None:
 
 def cone_problem(system: ContactSystem, comm: MPI.Comm) -> ccp.ConeProblem:
     """The cone problem of a step's contacts."""
-    G, point, key, soft = system.problem_map, system.point, system.key, system.compliance
     r: Array = system.r
-    if (resists := system.resistance) is None:
-        return ccp.ConeProblem(comm, r, system.mu, G=G, point=point, key=key, compliance=soft)
-    r, cones = np.concatenate([r, resists.velocity]), ccp.RollingCones(system.mu, *resists.most)
-    return ccp.ConeProblem(comm, r, cones=cones, G=G, point=point, key=key, compliance=soft)
+    cones: ccp.FrictionCones | ccp.RollingCones = ccp.FrictionCones(system.mu)
+    if (resists := system.resistance) is not None:
+        r, cones = np.concatenate([r, resists.velocity]), ccp.RollingCones(system.mu, *resists.most)
+    of_contacts = system.point, system.key, system.compliance
+    return ccp.ConeProblem.of_bodies(comm, r, cones, system.problem_map, *of_contacts)
 
 
 def _peak_memory(comm: MPI.Comm) -> int:

@@ -18,8 +18,8 @@ every start, so that the courses part. Both codes take the same starts. For each
 
 The limit of small steps and stiff contacts, from which errors of the torque are reckoned, is the mean of two that know
 nothing of each other: LIGGGHTS with its stiffest contacts, and our smallest steps. Its standard error is what the two
-show, or what their starts do, if that is more. Writes results/compare_liggghts.json and .png; without words (15 minutes)
-its section of docs/measurements.md and docs/liggghts.png, too.
+show, or what their starts do, if that is more. Writes results/compare_liggghts.json and .png; without words (15
+minutes) its section of docs/measurements.md and docs/liggghts.png, too.
 
 With --cores it measures seconds by the clock on one rank and on two, of one start: LIGGGHTS with 1e8 N/m, and our
 defaults. Without more words it writes a section, too: 5 minutes, and half an hour once to settle the bed of n = 32.

@@ -46,7 +46,7 @@ def collectives(step):
 
 def is_in_solve(frame):
     while frame is not None:
-        if frame.f_code is ccp.solve.__code__:
+        if frame.f_code is ccp.solved.__code__:
             return True
         frame = frame.f_back
     return False
@@ -54,12 +54,12 @@ def is_in_solve(frame):
 
 @pytest.mark.parallel(2)
 def test_a_step_has_few_collectives_outside_of_the_solve():
-    """20, 22 where islands may be at rest, and 34 in the few in which bodies go to other ranks."""
+    """19, 21 where islands may be at rest, and 33 in the few in which bodies go to other ranks."""
     sim = pctt.Simulation(Mixer(n=2), comm=Counting(MPI.COMM_WORLD), solver="apgd", dt=0.01)
     sim.run(steps=20)
     counts = [collectives(sim.step) for _ in range(20)]
     outside = sorted(outside for _, outside in counts)
-    assert outside[10] <= 23
-    assert outside[-1] <= 38
+    assert outside[10] <= 22
+    assert outside[-1] <= 37
     assert outside[0] > 0
     assert all(solve > 0 for solve, _ in counts)

@@ -82,8 +82,8 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
     """The best impulses that accelerated projected steps find from a first guess."""
     scaled, coulomb = progress.problem, progress.problem.coulomb
     now = scaled.iterate(scaled.start(guess))
-    last, new, gradient = now.copy(), now.copy(), np.empty_like(now.x)
-    y = gradient
+    last, new = now.copy(), now.copy()
+    y = gradient = np.empty(now.x.shape, scaled.precision)
     lipschitz, whole = options.lipschitz, True
     theta, beta, step, least = options.theta, 0.0, 0.0, np.inf  # momentum is beta; |L step|^2, its least since beta = 0
     most, flattest, before = 1.0, np.inf, (now.x.copy(), scaled.b)  # of beta; curvature; at the last look
@@ -91,7 +91,7 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
         if progress.is_due(math.sqrt(step)):
             (now, last, new), y = scaled.restore(now, last, new), gradient
             slope = scaled.look(now, y)
-            if not progress.goes_on(now.x, slope):
+            if not progress.goes_on(now.x, slope, exact=True):
                 return progress.impulse
             whole = True
             if coulomb:
@@ -109,7 +109,8 @@ def _descend(progress: Progress, guess: Array, options: APGD) -> Array:
             if not (length > 0 and curvature > allowed):  # also ends on a number that is none
                 break
             lipschitz = options.margin * curvature / length
-        progress.watch(curvature, length, lipschitz)
+        if curvature < 0.0:
+            progress.watch(curvature, length, lipschitz)
         step = lipschitz**2 * length
         if uphill > 0 or (coulomb and step > options.growth * least):
             theta, beta, least = options.theta, 0.0, np.inf

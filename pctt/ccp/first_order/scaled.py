@@ -129,13 +129,14 @@ class ScaledProblem:
         slope += y
         return slope
 
-    def restore(self, now: Iterate, last: Iterate, new: Iterate) -> list[Iterate]:
+    def restore(self, *iterates: Iterate) -> Sequence[Iterate]:
         """The iterates with all contacts, of which the last is memory for a new one."""
         rows, self._active = self._active.rows, self._all
-        if rows is not None:
-            for iterate in (now, last):
-                _spread(rows, iterate.room)
-        return [Iterate(room, image, room) for _, image, room in (now, last, new)]
+        if rows is None:
+            return iterates
+        for iterate in iterates[:-1]:
+            _spread(rows, iterate.room)
+        return [Iterate(room, image, room) for _, image, room in iterates]
 
     def restrict(
         self, now: Iterate, last: Iterate, new: Iterate, y: Array, length: float
@@ -184,11 +185,7 @@ class ScaledProblem:
 
     def dots(self, *pairs: tuple[Array, Array]) -> Array:
         """Scalar products of pairs of arrays over all contacts, in one reduction over the ranks."""
-        return self.sums(*(float(np.vdot(x, y)) for x, y in pairs))
-
-    def sums(self, *parts: float) -> Array:
-        """Sums of numbers over the ranks, in one reduction."""
-        return self.problem.sum(np.array(parts, dtype=float))
+        return self.problem.sum(np.array([x.ravel().dot(y.ravel()) for x, y in pairs], dtype=float))
 
     def block_steps(self) -> Array:
         """1 over the largest eigenvalue of each contact's diagonal block of A, per unknown (nc, 3)."""
@@ -295,7 +292,7 @@ class Progress:
         self._met: int | None = None  # the iteration at which the limits were met
 
     def is_due(self, size: float) -> bool:
-        """Whether `goes_on` will look: after ``check`` iterations, or a few after the last look where the residual
+        """Whether it is time for `goes_on`: after ``check`` iterations, or a few after the last look where the residual
         would be a little below the tolerance, as a look costs more than an iteration, if it had changed as the ``size``
         of steps has: |L step|, 0 before the first.
 
@@ -306,16 +303,16 @@ class Progress:
         if self.iterations >= early and residual * size <= 0.9 * wanted * size_then:
             self._next_look = self.iterations
         self._size = size
-        return self.iterations >= min(self._next_look, self.limits.max_it)
+        return self.iterations >= self._next_look
 
-    def goes_on(self, x: Array, gradient: Array | None = None) -> bool:
+    def goes_on(self, x: Array, gradient: Array | None = None, exact: bool = False) -> bool:
         """Whether to iterate further from x. Every ``check`` iterations this computes the residual.
 
-        ``gradient`` is A x + b if the method has it."""
-        if self.iterations < min(self._next_look, self.limits.max_it):
+        ``gradient`` is A x + b if the method has it, ``exact`` in double precision where it comes from x itself."""
+        if self.iterations < self._next_look:
             return True
-        self._next_look = self.iterations + self.check
-        residual = self._residual(x, gradient)
+        self._next_look = min(self.iterations + self.check, self.limits.max_it)
+        residual = self._residual(x, gradient, exact and self.problem.precision is np.float64)
         self.history.append(residual)
         self.limits.report(self.iterations, residual)
         self.looked = x.copy()
@@ -330,7 +327,7 @@ class Progress:
         return not self.reason
 
     def watch(self, curvature: float, square: float, largest: float) -> None:
-        """Note d'Ad and |d|^2 of a step d, and an estimate of the largest eigenvalue of A, which is one at least."""
+        """Note a negative d'Ad and |d|^2 of a step d, and an estimate of the largest eigenvalue of A, one at least."""
         if square > 0:
             self._lowest = min(self._lowest, curvature / (square * max(largest, 1.0)))
 
@@ -350,12 +347,12 @@ class Progress:
         given = self.impulse, status, self.reason, self.best, self.iterations
         return Result(*given, beyond=self.beyond, history=self.history, exhausted=indefinite)
 
-    def _residual(self, x: Array, gradient: Array | None) -> float:
+    def _residual(self, x: Array, gradient: Array | None, exact: bool) -> float:
         """The residual that the tolerance is for; nan where x or its gradient is no number."""
         if gradient is not None:
             residual = self._judge(self.problem.errors(x, gradient), x)
             # inf where x = 0, or x is no number; methods that update the gradient collect rounding: look twice
-            if self.limits.tol < residual < np.inf:
+            if (exact or self.limits.tol < residual) and residual < np.inf:
                 return residual
         g, problem = self.problem.impulse(x), self.problem.problem
         y = problem.product(g)  # in double precision
