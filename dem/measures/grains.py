@@ -63,7 +63,7 @@ def bearing(sample: Sample) -> Bools:
     """Return the mask (nc,) of this rank's contacts that bear force: their normal force exceeds 1 % of the mean, as
     solvers leave small forces at others."""
     normal = np.einsum("ck,ck->c", sample.force, sample.normal)
-    total, count = sample.comm.allreduce(np.array([normal.sum(), len(normal)]))
+    total, count = summed(sample, [normal.sum(), float(len(normal))])
     mask: Bools = normal > 0.01 * total / max(count, 1.0)
     return mask
 

@@ -12,6 +12,7 @@ from dem.arrays import Bools, Floats, Ints
 from dem.bodies import FORM
 from dem.measures.images import images
 from dem.shapes import solid
+from dem.together import barrier
 
 
 @dataclass(frozen=True, repr=False)
@@ -77,6 +78,7 @@ class Sample:
 
 def summed(sample: Sample, values: Any) -> Any:
     """The sum over the ranks of a number or an array."""
+    barrier(sample.comm, "a measure")
     out = np.array(values)
     sample.comm.Allreduce(MPI.IN_PLACE, out)
     return out[()]

@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 import pctt
 from pctt import Box, Dynamic, Fixed, Glide, Mesh, Plane, Rotation, Scene, Simulation, measures
+from dem.together import SceneError
 from pctt.disk import FileError
 from pctt.options import OptionError
 from pctt.scenes import Mixer
@@ -330,3 +331,14 @@ def test_messages_speak_python(tmp_path):
         sim.save(tmp_path / "mixer.h5")
     with pytest.raises(OptionError, match=f"^n 2: {tmp_path}/mixer.h5 was made with n 1; allowed is the same"):
         Simulation.load(tmp_path / "mixer.h5", Mixer(n=2))
+
+
+@pytest.mark.parallel(2)
+def test_other_calls_on_other_ranks_are_told():
+    sim, first = Simulation(falling(), dt=0.01), MPI.COMM_WORLD.rank == 0
+    with pytest.raises(SceneError, match="rank 0 at step of a Simulation, rank 1 at position of a Simulation"):
+        sim.step() if first else sim.positions
+    sim.step()
+    whole = measures.Block((0, 0, 0), (1, 1, 1))
+    with pytest.raises(SceneError, match="rank 0 at a measure, rank 1 at change of a Simulation"):
+        measures.fabric(sim.sample, whole) if first else sim.change("body floor", motion=Fixed())
