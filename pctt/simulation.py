@@ -41,7 +41,7 @@ from dem.parts.springs import Spring
 from dem.record.energies import energy
 from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.start import step_remark
-from dem.start.doubts import doubts
+from dem.start.doubts import RoomWatch, doubts
 from dem.start.time_step import fall_remark, reason, smallest
 from dem.start.tools import PaceWatch, SwingWatch
 from dem.start.turns import TurnWatch
@@ -63,7 +63,6 @@ from pctt.run.output import Place, Writer, described_bodies, described_forms, re
 from pctt.run.overlaps import OverlapWatch
 from pctt.run.settings import Run, Settings, refuse_unlike, scene_name
 from pctt.run.stepper import NewStep, NoSolutionError, Stepper
-
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -152,7 +151,7 @@ class Simulation:
         if likely := "" if restart else comm.bcast(doubts(scene)):
             warn(comm, likely)
         half = smallest(scene)
-        self._watches = TurnWatch(), SwingWatch(), PaceWatch(half, scene.leaving), LooseWatch(half)
+        self._watches = TurnWatch(), SwingWatch(), PaceWatch(half, scene.leaving), LooseWatch(half), RoomWatch()
         self._tell_turns()
         self._begun = restart
         self.restart = "" if isinstance(restart, state.RunState) else str(restart)  #: the file from which it goes on
@@ -525,6 +524,8 @@ class Simulation:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
         given = folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems
         folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems = self.comm.bcast(given)
+        if not isinstance(folder, (str, Path)) or not str(folder):
+            raise OptionError(f"write({folder!r}): allowed is the name of a folder")
         run = Run(output_every=every, checkpoint_every=checkpoint_every, checkpoint_minutes=checkpoint_minutes)
         try:
             refuse_bad(run)

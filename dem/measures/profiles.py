@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -73,7 +74,7 @@ def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> 
 
     With p the fraction of them among all, and s^2 the variance of the fractions in the cells, each with the weight of
     its grains: Lacey's index is (p (1 - p) - s^2) / (p (1 - p) - p (1 - p) / m) for cells of m grains on average that
-    are not empty. NaN if there is one kind alone, or one grain per cell."""
+    are not empty. NaN if there is one grain per cell, or, with a warning, one kind alone."""
     refuse_region("mixing", region, Block)
     shape, (low, high), mask = counts("cells", cells), region.bounds, sample.marked(mask)
     rows, position, _ = sample.grains_in(low, high)
@@ -90,6 +91,9 @@ def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> 
     apart, variance = p * (1.0 - p), float(count @ (fraction - p) ** 2) / total
     by_chance = apart * len(count) / total
     if apart <= 0.0:
+        if sample.comm.rank == 0:
+            few = "no" if p == 0.0 else "every"
+            warnings.warn(f"mixing: the mask has {few} grain of the region, so there is no index", stacklevel=2)
         return Mixing(np.nan, np.nan)
     lacey = (apart - variance) / (apart - by_chance) if by_chance < apart else np.nan
     return Mixing(lacey, variance / apart)
