@@ -12,7 +12,7 @@ import numpy as np
 from dem.arrays import ArrayLike, Bools, Floats
 from dem.checks import counts, unit_vector
 from dem.geometry.region import Block, refuse_region
-from dem.measures.sample import Sample, summed
+from dem.measures.sample import Sample, measure, summed
 
 
 class Profile(NamedTuple):
@@ -24,6 +24,7 @@ class Profile(NamedTuple):
     velocity: Floats  #: (bins, 3) mean, weighted by mass; 0 in empty bins [m/s]
 
 
+@measure
 def profile(sample: Sample, axis: ArrayLike, edges: ArrayLike) -> Profile:
     """Return what is where along a direction `axis` (3,), in bins between the ascending `edges` (bins + 1,) [m].
 
@@ -55,6 +56,7 @@ def _direction(axis: ArrayLike) -> Floats:
         raise ValueError(f"axis {axis!r}: {allowed}") from None
 
 
+@measure
 def mean_position(sample: Sample, mask: Bools) -> Floats:
     """Return the mean (3,) of the centres of the grains of a mask (n,) [m]; NaN if there are none."""
     mask = sample.marked(mask)
@@ -69,6 +71,7 @@ class Mixing(NamedTuple):
     intensity: float  #: of segregation, variance over p (1 - p); 1: apart, 0: even (Danckwerts 1952)
 
 
+@measure
 def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> Mixing:
     """Return the mixing of the grains of a mask (n,) with the others, by centres in the cells of a grid.
 
@@ -93,7 +96,7 @@ def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> 
     if apart <= 0.0:
         if sample.comm.rank == 0:
             few = "no" if p == 0.0 else "every"
-            warnings.warn(f"mixing: the mask has {few} grain of the region, so there is no index", stacklevel=2)
+            warnings.warn(f"mixing: the mask has {few} grain of the region, so there is no index", stacklevel=3)
         return Mixing(np.nan, np.nan)
     lacey = (apart - variance) / (apart - by_chance) if by_chance < apart else np.nan
     return Mixing(lacey, variance / apart)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from functools import wraps
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -13,6 +15,8 @@ from dem.bodies import FORM
 from dem.measures.images import images
 from dem.shapes import solid
 from dem.together import barrier
+
+Measure = TypeVar("Measure", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, repr=False)
@@ -74,6 +78,19 @@ class Sample:
             else:
                 out[rows] = solid(int(kind), self.size[rows], np.ones(rows.sum()))[0]
         return out
+
+
+def measure(function: Measure) -> Measure:
+    """A function of a sample: TypeError for anything else, such as the simulation that has it."""
+
+    @wraps(function)
+    def checked(sample: Sample, *given: Any, **named: Any) -> Any:
+        if not isinstance(sample, Sample):
+            allowed = "allowed is a Sample, such as sim.sample"
+            raise TypeError(f"measures.{function.__name__}: {allowed}, got {type(sample).__name__}")
+        return function(sample, *given, **named)
+
+    return cast(Measure, checked)
 
 
 def summed(sample: Sample, values: Any) -> Any:

@@ -309,7 +309,7 @@ def test_an_output_folder_under_a_regular_file_is_refused(program, results, tmp_
 @pytest.mark.parallel(1, 2)
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_scene_that_flies_apart_ends_with_one_line(program):
-    done = program(*SMALL, "-scene_gravity", 1e150, "-dt", 1e100, "-steps", 3, status=1)
+    done = program(*SMALL, "-scene_gravity", 1e150, "-dt", 1e3, "-steps", 3, status=1)
     assert "step" in one_line(done, 1)
 
 

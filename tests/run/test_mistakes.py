@@ -54,7 +54,10 @@ def test_what_is_no_region_is_refused():
         measures.mixing(sim.sample, whole, tube, (2, 2, 2))
     with pytest.raises(ValueError, match=r"region of an outlet: allowed .*, got Box\(half_extents"):
         falling().add_outlet("out", Box((1, 1, 1)))
-    assert measures.mixing(sim.sample, whole, block, (2, 2, 2))
+    with pytest.raises(TypeError, match="measures.stress: allowed is a Sample, such as sim.sample, got Simulation"):
+        measures.stress(sim, block)
+    with pytest.warns(UserWarning, match="the mask has every grain of the region"):
+        measures.mixing(sim.sample, whole, block, (2, 2, 2))
 
 
 def test_an_attribute_that_a_simulation_does_not_have_is_not_set():
