@@ -10,28 +10,56 @@ import numpy as np
 
 from dem.arrays import ArrayLike, Floats, Ints
 
+MOST = 1e150  #: squares of greater numbers overflow
 
-def nearest(name: str, known: Iterable[str], dash: str = "", alike: float = 0.6) -> str:
+
+def nearest(name: str, known: Iterable[str], dash: str = "", alike: float = 0.61) -> str:
     """Return the end of a message: the known name that the user may have meant, if the two are ``alike`` (of
-    `difflib`), or that is the beginning of the name."""
-    begins = sorted((each for each in known if len(each) > 2 and name.startswith(each)), key=len, reverse=True)
+    `difflib`), or that is the beginning of the name and not of a group with underscores."""
+    begun = (each for each in known if len(each) > 2 and name.startswith(each) and name[len(each) :][:1] != "_")
+    begins = sorted(begun, key=len, reverse=True)
     close = begins or difflib.get_close_matches(name, sorted(known), n=1, cutoff=alike)
     return f"; did you mean {dash}{close[0]}?" if close else ""
 
 
+def new_name(what: str, name: Any, taken: Iterable[str]) -> None:
+    """Raise ValueError unless this is a name that none of `what` has yet."""
+    if not isinstance(name, str) or not name or name in taken:
+        raise ValueError(f"{what} need distinct names, got {name!r}")
+
+
+def short(values: Any) -> str:
+    """What a user gave, in a few words."""
+    text = repr(values.tolist() if isinstance(values, np.ndarray) else values)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def numbers(name: str, values: Any) -> Floats:
+    """Return `values` as a float array; ValueError for texts and other things, rows of unlike lengths, and complex
+    numbers."""
+    try:
+        array = np.asarray(values)
+        return array.astype(np.float64, casting="unsafe" if array.dtype.kind in "OUS" else "same_kind", copy=False)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: allowed are real numbers, got {short(values)}") from None
+
+
+def number(name: str, value: Any) -> float:
+    """Return one number, which may be infinite or NaN."""
+    array = numbers(name, value)
+    if array.ndim:
+        raise ValueError(f"{name}: allowed is one number, got {short(value)}")
+    return float(array)
+
+
 def finite(name: str, values: ArrayLike) -> Floats:
-    """Return `values` as a float array; ValueError if a number is NaN or infinite."""
-    array = np.asarray(values, dtype=np.float64)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name}: NaN or infinite number")
-    return array
-
-
-def points(name: str, values: ArrayLike) -> Floats:
-    """Return `values` (m) as a float array; ValueError unless all are finite, and their squares."""
-    array = finite(name, values)
-    if (most := float(np.abs(array).max(initial=0.0))) > 1e150:
-        raise ValueError(f"{name} must be from -1e150 to 1e150 m, as squares beyond overflow, got {most:g}")
+    """Return `values` as a float array; ValueError if a number is NaN or infinite, or has no finite square."""
+    array = numbers(name, values)
+    good = np.abs(array) <= MOST
+    if not good.all():
+        wrong = array[~good].flat[0]
+        what = f"allowed is up to {MOST:g}, got {wrong:g}" if np.isfinite(wrong) else "NaN or infinite number"
+        raise ValueError(f"{name}: {what}" + (f" in row {np.argwhere(~good)[0, 0]}" if array.ndim else ""))
     return array
 
 
@@ -45,6 +73,7 @@ def positive(name: str, values: ArrayLike) -> Floats:
 
 def positive_or_inf(name: str, value: float) -> None:
     """Raise ValueError unless a number is above zero; inf is."""
+    value = number(name, value)
     if not value > 0.0:
         raise ValueError(f"{name} must be positive, or inf, got {value:g}")
 
@@ -61,6 +90,7 @@ def between(low: float, high: float = np.inf) -> Callable[[str, float], None]:
     """Return a check that a number is not below `low` and not above `high`."""
 
     def check(name: str, value: float) -> None:
+        value = number(name, value)
         if not low <= value <= high:
             allowed = f"at least {low:g}" if high == np.inf else f"from {low:g} to {high:g}"
             raise ValueError(f"{name} must be {allowed}, got {value:g}")
@@ -87,9 +117,12 @@ def shape(name: str, array: Floats, count: int, *row: int) -> None:
         raise ValueError(f"{name} must have shape {row} or {(count, *row)}, got {array.shape}")
 
 
-def vector(name: str, values: ArrayLike) -> Floats:
-    """Return three finite numbers."""
-    return rows(name, values, 1, 3)[0]
+def vector(name: str, values: ArrayLike, count: int = 3) -> Floats:
+    """Return so many finite numbers."""
+    array = finite(name, values)
+    if array.shape not in ((count,), (1, count)):
+        raise ValueError(f"{name} must be {count} numbers, got {short(values)}")
+    return array.reshape(count).copy()
 
 
 def seed(name: str, value: Any) -> int:
@@ -127,15 +160,15 @@ def not_zero(name: str, values: ArrayLike) -> Floats:
 
 def unit_quaternion(name: str, values: ArrayLike) -> Floats:
     """Return one quaternion (4,), scaled to unit norm."""
-    array = rows(name, values, 1, 4)
-    size = np.linalg.norm(array, axis=1, keepdims=True)
-    if size[0, 0] == 0.0:
-        raise ValueError(f"{name}: zero quaternion")
-    return (array / size)[0]
+    array = vector(name, values, 4)
+    return not_zero(name, array) / np.linalg.norm(array)
 
 
 def check_fields(instance: Any, **checks: Callable[[str, Any], Floats]) -> None:
-    """Put numbers, or tuples of numbers, that have passed a check of this module into fields of a frozen dataclass."""
+    """Put numbers, or tuples of numbers, that have passed a check of this module into fields of a frozen dataclass; a
+    field of the type float takes one number."""
     for name, check in checks.items():
-        value = check(f"{type(instance).__name__}.{name}", getattr(instance, name)).tolist()
+        full, given = f"{type(instance).__name__}.{name}", getattr(instance, name)
+        one = instance.__dataclass_fields__[name].type == "float"
+        value = check(full, number(full, given) if one else given).tolist()
         object.__setattr__(instance, name, tuple(value) if isinstance(value, list) else value)

@@ -19,7 +19,7 @@ import numpy as np
 
 from dem import quaternion
 from dem.arrays import Floats
-from dem.checks import check_fields, finite, positive, rows, unit_quaternion, unit_vector, vector
+from dem.checks import check_fields, finite, number, numbers, positive, rows, unit_quaternion, unit_vector, vector
 
 DROOP = 1e-3  #: of its speed that a servo loses at most under a load that it can bear
 
@@ -31,8 +31,10 @@ class Timed:
     end: float  #: [s]
 
     def _check_times(self) -> None:
-        if not (np.isfinite(self.start) and self.start <= self.end):
-            raise ValueError(f"{type(self).__name__} cannot begin at {self.start:g} s and end at {self.end:g} s")
+        kind = type(self).__name__
+        start, end = number(f"start of {kind}", self.start), number(f"end of {kind}", self.end)
+        if not (np.isfinite(start) and start <= end):
+            raise ValueError(f"{kind} cannot begin at {start:g} s and end at {end:g} s")
 
     def elapsed(self, time: float) -> float:
         """How much of the time between start and end has gone by [s]."""
@@ -180,8 +182,8 @@ class Held(Dynamic, Timed):
         self._check_times()
         for name in ("velocity", "angular_velocity"):
             given = tuple(getattr(self, name))
-            numbers = vector(f"Held.{name}", [0.0 if value is None else value for value in given])
-            values = tuple(None if value is None else float(x) for value, x in zip(given, numbers))
+            found = vector(f"Held.{name}", [0.0 if value is None else value for value in given])
+            values = tuple(None if value is None else float(x) for value, x in zip(given, found))
             object.__setattr__(self, name, values)
         held = [value for value in self.angular_velocity if value is not None]
         if len(held) == 1 or (len(held) == 2 and any(held)):
@@ -308,7 +310,7 @@ class Path:
     positions: Sequence[Sequence[float]]  #: (n, 3) [m]
 
     def __post_init__(self) -> None:
-        times = tuple(float(time) for time in self.times)
+        times = tuple(numbers("times of a path", self.times).ravel().tolist())
         if not times or not np.isfinite(times).all() or times[0] < 0.0 or (np.diff(times) <= 0.0).any():
             listed = ", ".join(f"{time:g}" for time in times) or "none"
             raise ValueError(f"times of a path must ascend from zero or later, got {listed}")
@@ -327,7 +329,7 @@ class Path:
         except OSError as error:
             raise ValueError(f"{file}: cannot be read ({error.strerror or error})") from None
         found = []
-        for number, line in enumerate(text.splitlines(), 1):
+        for row, line in enumerate(text.splitlines(), 1):
             words = line.partition("#")[0].replace(",", " ").split()
             if not words:
                 continue
@@ -335,7 +337,7 @@ class Path:
                 time, *place = map(float, words)
                 found.append((time, vector("place", place)))
             except ValueError:
-                raise ValueError(f"{file}, line {number}: not a time and three coordinates: {line.strip()}") from None
+                raise ValueError(f"{file}, line {row}: not a time and three coordinates: {line.strip()}") from None
         try:
             return cls(*zip(*found)) if found else cls((), ())
         except ValueError as error:
@@ -375,7 +377,7 @@ def checked_pose(motion: Prescribed, time: float, position: Floats, orientation:
     ValueError if it is no pose."""
     place, turn = motion.pose(time, position.copy(), orientation.copy())
     what = f"of the pose of {type(motion).__name__} at {time:g} s"
-    return rows(f"position {what}", place, 1, 3)[0], unit_quaternion(f"quaternion {what}", turn)
+    return vector(f"position {what}", place), unit_quaternion(f"quaternion {what}", turn)
 
 
 def mean_velocity(motion: Prescribed, time: float, dt: float, position: Floats, orientation: Floats) -> Floats:

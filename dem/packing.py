@@ -65,6 +65,7 @@ def random_packing(
     of that leave overlaps, as the fraction is too high.
     """
     box = checks.vector("lengths of a packing", checks.positive("lengths of a packing", lengths))
+    fraction = checks.number("solid fraction", fraction)
     if not 0.0 < fraction < 0.74:
         raise ValueError(f"solid fraction must be between 0 and 0.74, got {fraction:g}")
     sizes = sizes_of(radius)

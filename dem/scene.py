@@ -85,6 +85,7 @@ class LargeBody:
     mass: float  #: infinite unless the motion is dynamic [kg]
     inertia: Floats  #: (3,) principal moments in the body frame; infinite if the body cannot turn [kg m^2]
     surface: SurfaceVelocity | None = None  #: of its surface along itself, in the body frame [m/s]
+    density: float | None = None  #: from which its mass is made [kg/m^3]
 
     def pose(self, time: float) -> Pose:
         """The pose at a time [s], of a motion that does not answer to forces. ValueError if it is none."""
@@ -419,8 +420,7 @@ class Scene:
         frame of a hinged body is turned until its z axis is that of the hinge, and its centre of mass must be on that
         axis. Two large bodies touch if at least one of them is dynamic.
         """
-        if not name or name in (body.name for body in self.large_bodies):
-            raise ValueError(f"large bodies need distinct names, got {name!r}")
+        checks.new_name("large bodies", name, [body.name for body in self.large_bodies])
         if not isinstance(shapes, Iterable) or not (shapes := tuple(shapes)):
             raise ValueError(f"shapes of {name!r}: {shapes!r}; allowed is a list of one or more")
         refuse_other_than_shapes(name, shapes)
@@ -473,8 +473,8 @@ class Scene:
         function of the time [s] and the table of the bodies, see `dem.parts.loads.Load`. They act from `start` to
         `end` [s].
         """
-        if not name or name in self.named["load"] or name in (body.name for body in self.large_bodies):
-            raise ValueError(f"loads need names that no other load and no large body has, got {name!r}")
+        taken = [*self.named["load"], *(body.name for body in self.large_bodies)]
+        checks.new_name("loads and large bodies", name, taken)
         self.named["load"][name] = Load(on, force, torque, start, end)
 
     @_building
@@ -496,8 +496,7 @@ class Scene:
         of the world is a place [m]. stiffness [N/m], damping [N s/m], rest `length` [m]: None is the distance at time
         zero; with zero the spring acts in all directions.
         """
-        if not name or name in self.named["spring"]:
-            raise ValueError(f"springs need distinct names, got {name!r}")
+        checks.new_name("springs", name, self.named["spring"])
         spring = Spring((one, other), (anchor, other_anchor), stiffness, damping, 0.0 if length is None else length)
         rest = float(np.linalg.norm(spring.vector(f"spring {name!r}", self)))
         self.named["spring"][name] = spring if length is not None else replace(spring, length=rest)
@@ -526,10 +525,12 @@ class Scene:
         at most, with a torque or force of at most `strength` [N m, N]; inf: as much as it takes. `limits` (2,): least
         and greatest angle [rad] or position [m]. The two bodies go through each other, unless they are `touching`.
         """
-        if not name or name in self.named["joint"]:
-            raise ValueError(f"joints need distinct names, got {name!r}")
-        low, high = map(float, limits)
-        given = {"kind": kind, "speed": speed, "target": target, "strength": float(strength), "low": low, "high": high}
+        checks.new_name("joints", name, self.named["joint"])
+        ends = checks.numbers(f"limits of {name!r}", limits)
+        if ends.shape != (2,):
+            raise ValueError(f"limits of {name!r}: allowed are two numbers, got {checks.short(limits)}")
+        given = {"kind": kind, "speed": speed, "target": target, "strength": checks.number("strength", strength)}
+        given |= {"low": float(ends[0]), "high": float(ends[1])}
         joint = Joint.between(name, (one, other), self, anchor, axis, **given, touching=touching)
         self.named["joint"][name] = joint
 
@@ -762,7 +763,7 @@ class Scene:
         if not isinstance(positions, Rule):
             positions = np.atleast_2d(checks.finite("positions", positions))
         count, first = len(positions), self.count
-        columns = [Column.checked("positions", positions, count, 3, check=checks.points)]
+        columns = [Column.checked("positions", positions, count, 3, check=checks.finite)]
         row = (3,) if kind == BOX else ()
         for name, values in lengths.items():
             columns.append(Column.checked(name, values, count, *row, check=checks.positive))
@@ -849,7 +850,7 @@ def _centered(body: LargeBody, density: float) -> LargeBody:
     """The same body with its frame at the centre of mass along the principal axes, with mass and moments."""
     mass, center, tensor = shapes.mass_properties(body.shapes, density)
     moments, turn = quaternion.principal(tensor)
-    return replace(_reframed(body, center, turn), mass=mass, inertia=moments)
+    return replace(_reframed(body, center, turn), mass=mass, inertia=moments, density=density)
 
 
 def _refuse_beside_hinge(body: LargeBody, axis: Floats, arm: Floats) -> None:

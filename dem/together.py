@@ -9,8 +9,13 @@ learns that another one has failed or has left the code.
 from __future__ import annotations
 
 import hashlib
+import math
+import sys
+import threading
+import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import TypeVar
 
@@ -28,6 +33,42 @@ SCENE_FILE = "scene_file_"
 
 class SceneError(RuntimeError):
     """A scene that cannot go on; raised on all ranks alike."""
+
+
+class Patience:
+    """Says, once of each place, that this rank has waited there for others for some seconds: a call that some ranks do
+    not make waits for ever. A thread looks, so that a wait costs nothing."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self._wait = ("", 0, math.inf)  # place, rank and time of the beginning
+        self._thread: threading.Thread | None = None
+
+    @contextmanager
+    def waiting(self, where: str, rank: int) -> Iterator[None]:
+        """A block that waits for other ranks."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._look, daemon=True)
+            self._thread.start()
+        self._wait = where, rank, time.monotonic()
+        try:
+            yield
+        finally:
+            self._wait = "", 0, math.inf
+
+    def _look(self) -> None:
+        told = set()
+        while True:
+            time.sleep(0.5 * self.seconds)
+            where, rank, since = self._wait
+            if where not in told and time.monotonic() - since > self.seconds:
+                told.add(where)
+                says = f"rank {rank} has waited for {self.seconds:g} s for other ranks: {where}"
+                sys.stderr.write(f"{says}. All ranks must make this call; without one it waits for ever\n")
+                sys.stderr.flush()
+
+
+PATIENCE = Patience(20.0)
 
 
 def together(
@@ -56,15 +97,18 @@ def barrier(
 ) -> float:
     """Wait for all ranks at a place in the code of a scene; the sum of a number over them. Raises if one has failed or
     is at another place."""
+    if comm.size == 1 and failure is None:
+        return number
     here = digest(where) >> 8  # 52 bits
-    (total,), (wrong, most, least) = reduced(comm, (number,), (failure is not None, here, -here))
+    with PATIENCE.waiting(where, comm.rank):
+        (total,), (wrong, most, least) = reduced(comm, (number,), (failure is not None, here, -here))
     if not wrong and most == -least:
         return total
     places, failures = zip(*comm.allgather((where, failure)))
     if any(failures):
         raise common_error(failures)
     listed = ", ".join(f"rank {rank} at {place}" for rank, place in enumerate(places))
-    raise SceneError(f"the code of a scene must make the same calls on all ranks, but {listed}")
+    raise SceneError(f"a program must make the same calls on all ranks, but {listed}")
 
 
 @lru_cache(maxsize=1024)

@@ -75,21 +75,24 @@ def read_spheres(
     radius: ArrayLike | None = None,
     type: int | str | None = None,
     frame: int = -1,
-    length: float = 1.0,
+    length: float | None = None,
 ) -> dict[str, Any]:
     """Read the spheres of a file; what `Scene.add_spheres` takes: positions (n, 3) [m], radius [m] and density
     [kg/m^3], and if the file has them velocities (n, 3) [m/s, rad/s] and material, the types as "type 1", "type 2".
 
     `density` [kg/m^3] and `radius` [m], one for all or (n,), take the place of those of the file. `type`: only spheres
     of this one. `frame`: which one of a dump, -1 the last. `length`: the file's unit of length [m], 1e-3 for
-    millimetres; its masses are kg, its densities kg/m^3. Spheres with ids are in their order. ValueError, which names
-    the file and the line, for what cannot be read, is no number, or is missing.
+    millimetres, which a file has to have with it whose heading says mm, cm or um; its masses are kg, its densities
+    kg/m^3. Spheres with ids are in their order. ValueError, which names the file and the line, for what cannot be read,
+    is no number, or is missing.
     """
-    checks.positive("length", length)
+    checks.positive("length", 1.0 if length is None else length)
     try:
         data = Path(path).read_bytes()
-        found = _read(gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data, frame)
-        return _spheres(found, density, radius, type, length)
+        data = gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
+        if length is None and (unit := re.search(rb"[\[(](mm|cm|um)[\])]", data[:4096])):
+            raise Unreadable(f"its heading has {unit[0].decode()}; give length=, which is 1e-3 for millimetres")
+        return _spheres(_read(data, frame), density, radius, type, length or 1.0)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from None
     except EOFError:
@@ -314,7 +317,7 @@ def _frame(lines: list[str], at: dict[str, int], head: int, names: list[str]) ->
 
 def _table(data: bytes) -> list[Callable[[], Found]]:
     """Of a table with a line of names, or a comment that has them: #format of Yade, or one with x, y and z, as of
-    numpy.savetxt; without them they are x y z r."""
+    numpy.savetxt; without them they are x y z, and r if there are more."""
     lines = _lines(data)
     first = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), len(lines))
     if first == len(lines):
@@ -328,7 +331,7 @@ def _table(data: bytes) -> list[Callable[[], Found]]:
     else:
         told = (_heading(comment, len(words)) for comment in lines[:first])
         heads = [formats[-1].split("_")] if formats else [*filter(_places, told)]
-        names = heads[-1] if heads else ["x", "y", "z", "r", "clump"][: min(max(len(words), 4), 5)]
+        names = heads[-1] if heads else ["x", "y", "z", "r", "clump"][: min(max(len(words), 3), 5)]
     return [lambda: _rows(lines, first, None, names, range(20) if "attrs" in names else (0,), cut)]
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cache, lru_cache
 from typing import Any, TypeVar
 
-from dem.checks import nearest
+from dem.checks import MOST, nearest
 from dem.options import option as option
 
 Group = TypeVar("Group")
@@ -160,6 +160,8 @@ def _refuse(given: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> N
     allowed, test = check if isinstance(check, tuple) else finite
     if not test(value):
         raise OptionError(f"{given}: allowed is {allowed}")
+    if kind is float and MOST < abs(value) < math.inf:
+        raise OptionError(f"{given}: allowed is {allowed}, and up to {MOST:g}")
 
 
 def _truth(text: str) -> bool:

@@ -18,9 +18,9 @@ import html
 import json
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -41,7 +41,7 @@ from dem.parts.springs import Spring
 from dem.record.energies import energy
 from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.start import step_remark
-from dem.start.doubts import doubts
+from dem.start.doubts import RoomWatch, doubts
 from dem.start.time_step import fall_remark, reason, smallest
 from dem.start.tools import PaceWatch, SwingWatch
 from dem.start.turns import TurnWatch
@@ -63,6 +63,19 @@ from pctt.run.output import Place, Writer, described_bodies, described_forms, re
 from pctt.run.overlaps import OverlapWatch
 from pctt.run.settings import Run, Settings, refuse_unlike, scene_name
 from pctt.run.stepper import NewStep, NoSolutionError, Stepper
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def _collective(method: Method) -> Method:
+    """A method of a simulation at whose beginning all ranks meet: SceneError if some are in another one."""
+
+    @wraps(method)
+    def met(sim: Simulation, *given: Any, **named: Any) -> Any:
+        barrier(sim.comm, f"{method.__name__} of a Simulation")
+        return method(sim, *given, **named)
+
+    return cast(Method, met)
 
 
 class Simulation:
@@ -138,7 +151,7 @@ class Simulation:
         if likely := "" if restart else comm.bcast(doubts(scene)):
             warn(comm, likely)
         half = smallest(scene)
-        self._watches = TurnWatch(), SwingWatch(), PaceWatch(half, scene.leaving), LooseWatch(half)
+        self._watches = TurnWatch(), SwingWatch(), PaceWatch(half, scene.leaving), LooseWatch(half), RoomWatch()
         self._tell_turns()
         self._begun = restart
         self.restart = "" if isinstance(restart, state.RunState) else str(restart)  #: the file from which it goes on
@@ -177,6 +190,7 @@ class Simulation:
         other.last, other.figures = self.last, dict(self.figures)
         return other
 
+    @_collective
     def reset(self) -> None:
         """Go back to where the simulation began: time zero, or its checkpoint; collective. OptionError while `write`
         writes files."""
@@ -203,6 +217,7 @@ class Simulation:
 
     # -- steps -----------------------------------------------------------------------------------------------
 
+    @_collective
     def step(self) -> dict[str, Any]:
         """Make a step of dt; its `figures`. Warns of a jump of energy. SceneError if a body is lost, if code of the
         scene fails, or if the contacts have no solution: the state is then that before the step, which may be tried
@@ -261,6 +276,7 @@ class Simulation:
             if words := watch.look(self.world, self.settings.dt):
                 warn(self.comm, words)
 
+    @_collective
     def run(
         self,
         *bare: float,
@@ -426,6 +442,7 @@ class Simulation:
         """The loads by name; `change` changes them. Not collective."""
         return dict(self.world.named["load"])
 
+    @_collective
     def change(self, what: str, **values: Any) -> None:
         """Give a load, spring, joint, source, large body, pair of materials or the cell other values from now on::
 
@@ -473,6 +490,7 @@ class Simulation:
 
     # -- files -----------------------------------------------------------------------------------------------
 
+    @_collective
     @uninterrupted()
     def save(self, path: str | Path) -> None:
         """Keep the state in a checkpoint, from which `load` goes on. FileError if that fails."""
@@ -482,6 +500,7 @@ class Simulation:
     def _save(self, path: Path) -> None:
         state.save(path, self._origin, self.world, self.memory)
 
+    @_collective
     @uninterrupted()
     def write(
         self,
@@ -505,6 +524,8 @@ class Simulation:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
         given = folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems
         folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems = self.comm.bcast(given)
+        if not isinstance(folder, (str, Path)) or not str(folder):
+            raise OptionError(f"write({folder!r}): allowed is the name of a folder")
         run = Run(output_every=every, checkpoint_every=checkpoint_every, checkpoint_minutes=checkpoint_minutes)
         try:
             refuse_bad(run)
@@ -521,12 +542,14 @@ class Simulation:
         self.output = Writer(place, self.world, about, self._save, self._compare.summary, run)
         self.stepper.dump = Dump(self.settings, self.experiment, self.world, place, hard, str(problems))
 
+    @_collective
     @uninterrupted()
     def complete(self) -> None:
         """Write what the folder of `write` lacks of the last step."""
         if self.output and self.last:
             self.output.complete(self.last, self._row)
 
+    @_collective
     @uninterrupted()
     def analyse(self) -> dict[str, float]:
         """The numbers that the scene finds in the records that `write` wrote; they also go to summary.json."""

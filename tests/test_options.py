@@ -7,7 +7,7 @@ from typing import Optional
 
 import pytest
 
-from dem.checks import positive
+from dem.checks import nearest, positive
 from dem.experiment import Experiment
 from pctt.ksp_options import refuse_unknown
 from pctt.options import (
@@ -122,6 +122,11 @@ KNOWN = ["scene", "scene_n", "steps", "dt", "restart", "output", "compare", "com
 def test_a_misspelt_name_gets_the_nearest(name, nearest):
     with pytest.raises(OptionError, match=f"^-{name}: no such option; did you mean -{nearest}\\?$"):
         refuse_unknown(["scene", name], KNOWN)
+
+
+def test_a_group_or_a_name_that_is_little_alike_is_not_what_was_meant():
+    assert nearest("scene_angular_velocity", KNOWN) == nearest("scale", ["shape"]) == ""
+    assert nearest("tolerance", ["tol"]) == "; did you mean tol?"
 
 
 def test_a_name_like_none_of_ours_gets_a_pointer_to_the_help():

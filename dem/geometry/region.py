@@ -9,7 +9,7 @@ from typing import Any, Union, get_args
 import numpy as np
 
 from dem.arrays import Bools, Floats
-from dem.checks import positive
+from dem.checks import check_fields, positive, vector
 from dem.compiled import loop
 
 
@@ -21,6 +21,7 @@ class Block:
     high: Sequence[float]
 
     def __post_init__(self) -> None:
+        check_fields(self, low=vector, high=vector)
         positive("size of a Block", np.subtract(self.high, self.low))
 
     @property
@@ -67,7 +68,7 @@ class Cylinder:
     radius: float
 
     def __post_init__(self) -> None:
-        positive("radius of a Cylinder", self.radius)
+        check_fields(self, start=vector, end=vector, radius=positive)
         positive("length of a Cylinder", self.length)
 
     @property

@@ -12,7 +12,7 @@ from dem.checks import counts, positive
 from dem.compiled import loop
 from dem.geometry.region import Block, refuse_region
 from dem.measures.grains import branches, ends
-from dem.measures.sample import Sample, summed
+from dem.measures.sample import Sample, measure, summed
 
 #: The functions W of `fields`.
 KERNELS = ("gauss", "lucy")
@@ -31,6 +31,7 @@ class Fields(NamedTuple):
     kinetic_stress: Floats  #: (nx, ny, nz, 3, 3) [Pa]
 
 
+@measure
 def fields(sample: Sample, region: Block, cells: Sequence[int], width: float, kernel: str = "lucy") -> Fields:
     """Return coarse-grained fields on a grid of so many `cells` (3,) in the region.
 

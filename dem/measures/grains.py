@@ -10,7 +10,7 @@ from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
 from dem.compiled import loop
 from dem.measures.images import about, images
-from dem.measures.sample import Sample, summed
+from dem.measures.sample import Sample, measure, summed
 from dem.mesh import Mesh, Surface
 
 
@@ -59,11 +59,12 @@ def branches(sample: Sample, end: Ends, low: Floats, high: Floats, reach: float 
     return row, end.point.take(row, axis=0) + step @ sample.lattice, branch.take(row, axis=0)
 
 
+@measure
 def bearing(sample: Sample) -> Bools:
     """Return the mask (nc,) of this rank's contacts that bear force: their normal force exceeds 1 % of the mean, as
     solvers leave small forces at others."""
     normal = np.einsum("ck,ck->c", sample.force, sample.normal)
-    total, count = sample.comm.allreduce(np.array([normal.sum(), len(normal)]))
+    total, count = summed(sample, [normal.sum(), float(len(normal))])
     mask: Bools = normal > 0.01 * total / max(count, 1.0)
     return mask
 
@@ -77,6 +78,7 @@ class Grains(NamedTuple):
     coordination: Ints  #: (count,) number of contacts that bear force
 
 
+@measure
 def per_grain(sample: Sample) -> Grains:
     """Contact force, torque, stress times volume, and coordination number of every grain."""
     table, moment = np.zeros((sample.count, 16)), np.zeros((0, 3)) if sample.moment is None else sample.moment
@@ -114,6 +116,7 @@ def _add(bodies, center, point, force, moment, bears, table):
                 row[15] += bears[c]
 
 
+@measure
 def triangle_forces(sample: Sample, body: int, mesh: Mesh, position: Floats, turn: Floats) -> Floats:
     """Return forces (triangles, 3) of grains on the triangles of a mesh, in the world frame [N].
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -11,7 +12,7 @@ import numpy as np
 from dem.arrays import ArrayLike, Bools, Floats
 from dem.checks import counts, unit_vector
 from dem.geometry.region import Block, refuse_region
-from dem.measures.sample import Sample, summed
+from dem.measures.sample import Sample, measure, summed
 
 
 class Profile(NamedTuple):
@@ -23,6 +24,7 @@ class Profile(NamedTuple):
     velocity: Floats  #: (bins, 3) mean, weighted by mass; 0 in empty bins [m/s]
 
 
+@measure
 def profile(sample: Sample, axis: ArrayLike, edges: ArrayLike) -> Profile:
     """Return what is where along a direction `axis` (3,), in bins between the ascending `edges` (bins + 1,) [m].
 
@@ -54,6 +56,7 @@ def _direction(axis: ArrayLike) -> Floats:
         raise ValueError(f"axis {axis!r}: {allowed}") from None
 
 
+@measure
 def mean_position(sample: Sample, mask: Bools) -> Floats:
     """Return the mean (3,) of the centres of the grains of a mask (n,) [m]; NaN if there are none."""
     mask = sample.marked(mask)
@@ -68,12 +71,13 @@ class Mixing(NamedTuple):
     intensity: float  #: of segregation, variance over p (1 - p); 1: apart, 0: even (Danckwerts 1952)
 
 
+@measure
 def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> Mixing:
     """Return the mixing of the grains of a mask (n,) with the others, by centres in the cells of a grid.
 
     With p the fraction of them among all, and s^2 the variance of the fractions in the cells, each with the weight of
     its grains: Lacey's index is (p (1 - p) - s^2) / (p (1 - p) - p (1 - p) / m) for cells of m grains on average that
-    are not empty. NaN if there is one kind alone, or one grain per cell."""
+    are not empty. NaN if there is one grain per cell, or, with a warning, one kind alone."""
     refuse_region("mixing", region, Block)
     shape, (low, high), mask = counts("cells", cells), region.bounds, sample.marked(mask)
     rows, position, _ = sample.grains_in(low, high)
@@ -90,6 +94,9 @@ def mixing(sample: Sample, mask: Bools, region: Block, cells: Sequence[int]) -> 
     apart, variance = p * (1.0 - p), float(count @ (fraction - p) ** 2) / total
     by_chance = apart * len(count) / total
     if apart <= 0.0:
+        if sample.comm.rank == 0:
+            few = "no" if p == 0.0 else "every"
+            warnings.warn(f"mixing: the mask has {few} grain of the region, so there is no index", stacklevel=3)
         return Mixing(np.nan, np.nan)
     lacey = (apart - variance) / (apart - by_chance) if by_chance < apart else np.nan
     return Mixing(lacey, variance / apart)

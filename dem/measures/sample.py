@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from functools import wraps
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -12,6 +14,9 @@ from dem.arrays import Bools, Floats, Ints
 from dem.bodies import FORM
 from dem.measures.images import images
 from dem.shapes import solid
+from dem.together import barrier
+
+Measure = TypeVar("Measure", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, repr=False)
@@ -75,8 +80,22 @@ class Sample:
         return out
 
 
+def measure(function: Measure) -> Measure:
+    """A function of a sample: TypeError for anything else, such as the simulation that has it."""
+
+    @wraps(function)
+    def checked(sample: Sample, *given: Any, **named: Any) -> Any:
+        if not isinstance(sample, Sample):
+            allowed = "allowed is a Sample, such as sim.sample"
+            raise TypeError(f"measures.{function.__name__}: {allowed}, got {type(sample).__name__}")
+        return function(sample, *given, **named)
+
+    return cast(Measure, checked)
+
+
 def summed(sample: Sample, values: Any) -> Any:
     """The sum over the ranks of a number or an array."""
+    barrier(sample.comm, "a measure")
     out = np.array(values)
     sample.comm.Allreduce(MPI.IN_PLACE, out)
     return out[()]

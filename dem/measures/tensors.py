@@ -11,9 +11,10 @@ from dem.compiled import loop
 from dem.geometry.region import Block, Cylinder, Region, refuse_region
 from dem.measures.grains import bearing, branches, ends
 from dem.measures.images import images
-from dem.measures.sample import Sample, summed
+from dem.measures.sample import Sample, measure, summed
 
 
+@measure
 def stress(sample: Sample, region: Region | Bools, volume: float | None = None) -> Floats:
     """Return the mean contact stress (3, 3) of a region, or of the grains of a mask (n,) over a given volume [m^3]: the
     sum of force times branch over the volume [Pa]. A region counts of each branch the part within it, so neighbouring
@@ -27,6 +28,7 @@ def stress(sample: Sample, region: Region | Bools, volume: float | None = None) 
     return summed(sample, (part[:, None] * force).T @ branch) / _volume(region, volume)
 
 
+@measure
 def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None = None) -> Floats:
     """Return the kinetic part (3, 3) of the stress: the sum of m v' v' over the volume, of the grains with their
     centres in a region, or of those of a mask; v' is the velocity beyond the mean one of these [Pa]."""
@@ -42,6 +44,7 @@ def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None 
     return summed(sample, (beyond.T * mass) @ beyond) / _volume(region, volume)
 
 
+@measure
 def fabric(sample: Sample, region: Region) -> Floats:
     """Return the fabric tensor (3, 3): the mean of n n over the contacts that bear force and have their points in the
     region; its trace is 1, and 0 if there are no such contacts. ValueError for a mask."""
@@ -54,6 +57,7 @@ def fabric(sample: Sample, region: Region) -> Floats:
     return total[:9].reshape(3, 3) / (total[9] or 1.0)
 
 
+@measure
 def solid_fraction(sample: Sample, region: Region) -> float:
     """Return the volume of the grains in a region over its volume. Spheres that the faces of a Block cut count with the
     part inside, to 1e-3 of a sphere where several faces cut it and exactly where one does; other grains, and all in a

@@ -117,7 +117,7 @@ def law(
         if name not in CHECKS:
             allowed = f"allowed are {', '.join(CHECKS)}{checks.nearest(name, (*CHECKS, *beside))}"
             raise ValueError(f"{name}: no such coefficient of contacts; {allowed}")
-    given = {name: float(value) for name, value in values.items() if value is not None}
+    given = {name: checks.number(name, value) for name, value in values.items() if value is not None}
     return replace(before, **given) if before else ContactLaw(**given)
 
 

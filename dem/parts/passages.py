@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dem import checks
 from dem.arrays import Bools, Floats
 from dem.bodies import Bodies, concatenate, none
 from dem.geometry.region import Block, Cylinder, refuse_region
@@ -53,8 +54,9 @@ class Passages:
 
     def add(self, name: str, part: Source | Outlet) -> None:
         """Put a part under a name of its own; ValueError for another one."""
-        if not name or set(name) & set(',"\n') or name in self.names:
-            raise ValueError(f"sources and outlets need distinct names without commas, got {name!r}")
+        checks.new_name("sources and outlets", name, self.names)
+        if set(name) & set(',"\n'):
+            raise ValueError(f"sources and outlets need names without commas, got {name!r}")
         if isinstance(part, Source):
             self.sources[name] = part
         else:

@@ -20,7 +20,7 @@ class Uniform:
     high: float
 
     def __post_init__(self) -> None:
-        checks.positive("size of a grain", [self.low, self.high])
+        checks.check_fields(self, low=checks.positive, high=checks.positive)
         if self.high < self.low:
             raise ValueError(f"sizes from {self.low:g} to {self.high:g}: the second must not be less")
 

@@ -65,8 +65,7 @@ class Source(Named, Timed):
         if isinstance(self.shape, Form) and not self.shape.SCALES and (ends := self.sizes.ends) != (1.0, 1.0):
             wrong = " to ".join(f"{size:g}" for size in dict.fromkeys(ends))
             raise ValueError(f"radius of a source: {wrong}; its shape has one size, so allowed is 1, or none")
-        if not self.most >= 1:
-            raise ValueError(f"most grains of a source must be at least 1, got {self.most:g}")
+        checks.between(1)("most grains of a source", self.most)
         checks.seed("seed of a source", self.seed)
         checks.check_fields(self, velocity=checks.vector)
 

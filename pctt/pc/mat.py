@@ -142,9 +142,11 @@ def negated(A: PETSc.Mat) -> PETSc.Mat:
 
 
 def replaced_blocks(P: PETSc.Mat) -> Array | None:
-    """The diagonal blocks of a stored Mat, where some diagonal entry is zero: `without_singular`. None otherwise."""
-    zero = bool((P.getDiagonal().array_r == 0).any())
-    if not P.comm.tompi4py().allreduce(zero, op=MPI.LOR):
+    """The diagonal blocks of a stored Mat, where some diagonal entry is zero or no finite number: `without_singular`.
+    None otherwise."""
+    diagonal = P.getDiagonal().array_r
+    wrong = bool(((diagonal == 0) | ~np.isfinite(diagonal)).any())
+    if not P.comm.tompi4py().allreduce(wrong, op=MPI.LOR):
         return None
     size, here = P.getBlockSize(), P.getLocalSize()[0]
     indptr, indices, values = P.getDiagonalBlock().getValuesCSR()
@@ -157,11 +159,12 @@ def replaced_blocks(P: PETSc.Mat) -> Array | None:
 
 
 def without_singular(blocks: Array) -> Array:
-    """These blocks (n, bs, bs) with identities in place of singular ones, as PCJACOBI has ones in place of zeros."""
+    """These blocks (n, bs, bs) with identities in place of singular ones, as PCJACOBI has ones in place of zeros, and
+    NaN in place of infinite ones, whose inverses would be zero and residuals too."""
     finite = np.isfinite(blocks).all(axis=(1, 2))
     size = blocks.shape[1]
     singular = np.linalg.matrix_rank(np.where(finite[:, None, None], blocks, np.eye(size))) < size
-    return np.where(singular[:, None, None], np.eye(size), blocks)
+    return np.where(singular[:, None, None], np.eye(size), np.where(finite[:, None, None], blocks, np.nan))
 
 
 def _conjugate_gradients(A: PETSc.Mat, M: PETSc.Mat, kind: str, b: PETSc.Vec, steps: int) -> tuple[int, Array]:

@@ -321,13 +321,22 @@ def add_joints(draw: Draw, made: Mixture, places: np.ndarray, density: float) ->
         made.features.append(f"{kind} {'to the world' if first is None else 'joint'}")
 
 
+def one_of_each(draw: Draw, radius: float) -> list[Any]:
+    """A shape of each kind of grains, in a ball of this radius."""
+    centres, thick = radius * np.array([[0, 0, 0], [0.5, 0, 0], [0.1, 0.4, 0.2]]), 0.55 * radius
+    balls = Sphere(radius), Capsule(0.4 * radius, thick), Clump(centres, radius * np.array([0.45, 0.35, 0.3]))
+    axes = (thick, 0.4 * radius, 0.5 * radius)
+    return [*balls, Box(axes), Cylinder(0.5 * radius, radius), Superellipsoid(axes, (4.0, 3.0)), radius * draw.rock()]
+
+
 def add_source(draw: Draw, made: Mixture, size: np.ndarray, density: float) -> bool:
     """Grains that rain, and perhaps an outlet for some; whether there is one."""
     radius = made.radius
     above = size[2] + 5.0 * radius
-    of = draw.one(0.5 * radius, Uniform(0.3 * radius, 0.7 * radius))
+    of, shape = draw.one(0.5, Uniform(0.3, 0.7)), draw.one(*one_of_each(draw, radius))
+    of = 1.0 if isinstance(shape, Clump) else of
     made.scene.add_source(
-        "rain", Block((0, 0, above), (*size[:2], above + 4.0 * radius)), radius=of, density=density,
+        "rain", Block((0, 0, above), (*size[:2], above + 4.0 * radius)), radius=of, shape=shape, density=density,
         number_rate=20.0 * np.sqrt(G / radius), velocity=(0, 0, -np.sqrt(G * radius)),
     )  # fmt: skip
     made.fed.append("source")

@@ -205,7 +205,7 @@ def test_what_is_no_shape_of_grains_is_refused():
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             scene.add_grains([(0, 0, 0)], shape, 1000.0)
-    for given, message in ((dict(axes=(1, 1, 0)), "axes must be positive"), (dict(axes=(1, 1)), "axes must have shape"),
+    for given, message in ((dict(axes=(1, 1, 0)), "axes must be positive"), (dict(axes=(1, 1)), "axes must be 3"),
                            (dict(axes=(1, 1, 1), exponents=(2, 21)), "must be from 2 to 20, got 21")):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             Superellipsoid(**given)

@@ -115,7 +115,7 @@ def test_what_holds_a_body_on_both_sides_makes_no_contact():
         ({"angular_velocity": (None, None, 0.0)}, {}, "Held.angular_velocity .*: allowed are three numbers"),
         ({"angular_velocity": (None, 1.0, 0.0)}, {}, "allowed are three numbers, three times None"),
         ({"velocity": (0.0, np.nan, None)}, {}, "Held.velocity: NaN"),
-        ({"velocity": (0.0, 1.0)}, {}, "Held.velocity must have shape"),
+        ({"velocity": (0.0, 1.0)}, {}, "Held.velocity must be 3 numbers"),
         ({"start": 2.0, "end": 1.0}, {}, "Held cannot begin at 2 s"),
         ({"velocity": (1.0, 0.0, None)}, {"velocity": (1.0, 0, 2.0)}, "'wheel' is held: its initial velocity must be"),
     ],

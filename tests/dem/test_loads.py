@@ -165,7 +165,7 @@ def failing(time, table):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"name": "tool"}, "loads need names .* got 'tool'"),
+        ({"name": "tool"}, "loads and large bodies need distinct names, got 'tool'"),
         ({"on": "paper"}, "load 'a': 'paper' is neither a body nor a material"),
         ({"on": "floor"}, "load 'a': the motion of the body 'floor' is prescribed"),
         ({"on": [3, 3]}, "ids of grains, each once"),

@@ -106,9 +106,9 @@ def test_a_motion_that_defines_what_nothing_asks_for_is_refused():
     ("pose", "words"),
     [
         ((np.full(3, np.nan), TURN), "position of the pose of Own at 0.4 s: NaN"),
-        ((PLACE[:2], TURN), "position of the pose of Own at 0.4 s must have shape"),
+        ((PLACE[:2], TURN), "position of the pose of Own at 0.4 s must be 3 numbers"),
         ((PLACE, np.zeros(4)), "quaternion of the pose of Own at 0.4 s: zero quaternion"),
-        ((PLACE, PLACE), "quaternion of the pose of Own at 0.4 s must have shape"),
+        ((PLACE, PLACE), "quaternion of the pose of Own at 0.4 s must be 4 numbers"),
     ],
 )
 def test_what_is_no_pose_is_refused(pose, words):

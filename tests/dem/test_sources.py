@@ -204,6 +204,12 @@ def test_a_misspelt_argument_is_told_with_the_nearest_one():
 def test_bad_distributions_regions_and_names_are_refused():
     with pytest.raises(ValueError, match="the second must not be less"):
         Uniform(0.2, 0.1)
+    with pytest.raises(ValueError, match="Uniform.low: allowed is one number"):
+        Uniform((0.1, 0.2), 0.3)
+    with pytest.raises(ValueError, match="Block.low must be 3 numbers, got 0"):
+        Block(0, 1)
+    with pytest.raises(ValueError, match="most grains of a source: allowed are real numbers, got 'a'"):
+        source(most="a")
     with pytest.raises(ValueError, match="2 sizes of grains with 1 shares"):
         Listed((0.1, 0.2), (1.0,))
     scene = Scene(0.3)

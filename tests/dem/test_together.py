@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from mpi4py import MPI
 
+from dem import together
 from dem.together import first_differing_rank
 
 
@@ -29,3 +32,15 @@ def test_the_rank_with_other_words_or_numbers_is_found():
 def test_the_last_bits_of_another_processor_are_no_difference():
     x = np.random.default_rng(0).normal(size=100_000)
     assert first_differing_rank(MPI.COMM_WORLD, "", [x * (1.0 + 2e-16 * MPI.COMM_WORLD.rank)]) == 0
+
+
+@pytest.mark.parallel(2)
+def test_a_rank_that_waits_for_long_says_where(monkeypatch, capsys):
+    comm = MPI.COMM_WORLD
+    monkeypatch.setattr(together, "PATIENCE", together.Patience(0.04))
+    together.barrier(comm, "a place")
+    for _ in range(2):
+        time.sleep(0.2 * comm.rank)
+        together.barrier(comm, "another place")
+    said = capsys.readouterr().err
+    assert said.count("rank 0 has waited for 0.04 s for other ranks: another place. All ranks must") == 1 - comm.rank

@@ -162,6 +162,16 @@ def test_a_matrix_with_nan_is_said_to_have_it(value, place):
         solver(mat, "gmres", rank=10).setUp()
 
 
+def test_block_jacobi_of_a_matrix_with_an_infinite_diagonal_ends_no_solve_as_converged():
+    mat = poisson(8)
+    mat.scale(np.inf)
+    ksp = solver(mat, "cg")
+    x, b = mat.createVecs()
+    b.set(1.0)
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() < 0
+
+
 @pytest.mark.parallel(1, 2)
 def test_a_warning_names_the_solver():
     with warnings.catch_warnings(record=True) as heard:

@@ -25,6 +25,8 @@ BAD_OPTIONS = {
     "-steps -1": ["-1", ">= 0"],
     "-steps": ["whole number"],
     "-dt nan": ["nan", "positive"],
+    "-dt 1e300": ["1e300", "up to 1e+150"],
+    "-scene_angular_velocity 1e300": ["1e300", "up to 1e+150"],
     "-recovery_speed nan": ["nan", ">= 0"],
     "-checkpoint_every 0": ["0", ">= 1"],
     "-settle maybe": ["maybe", "true or false"],
@@ -307,7 +309,7 @@ def test_an_output_folder_under_a_regular_file_is_refused(program, results, tmp_
 @pytest.mark.parallel(1, 2)
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_scene_that_flies_apart_ends_with_one_line(program):
-    done = program(*SMALL, "-scene_gravity", 1e308, "-dt", 1e3, "-steps", 3, status=1)
+    done = program(*SMALL, "-scene_gravity", 1e150, "-dt", 1e3, "-steps", 3, status=1)
     assert "step" in one_line(done, 1)
 
 

@@ -186,6 +186,8 @@ DUMP = "ITEM: TIMESTEP\n0\nITEM: NUMBER OF ATOMS\n1\nITEM: ATOMS {0} radius dens
     ("# spheres at x y z\n1 2 3 4\n", {"density": 1}, r"line 2: 4 values where 5 are needed \(spheres at x y z\)$"),
     ("x,y,z,r\n1,2,3,4\n", {"density": 1, "length": 0}, "length must be positive, got 0"),
     ("x,y,z,r\n1,2,3,4\n", {"density": 1, "length": -1}, "length must be positive, got -1"),
+    ("x [mm],y [mm],z [mm],r [mm]\n1,2,3,4\n", {"density": 1}, r"its heading has \[mm\]; give length="),
+    ("1,2,3\n", {"density": 1}, "has no radius or diameter; its columns are x, y, z; give radius="),
     ("x,y,z,r\n1,2,3,4\n", {"density": 1, "type": 2}, r"type 2: has no type; its columns are x, y, z, radius"),
     ("x,y,z,r,type\n1,2,3,4,5\n", {"density": 1, "type": 2}, r"type 2: no sphere has it; there are 5"),
     ("", {}, r"bed: has no sphere"),
@@ -279,3 +281,8 @@ def test_ranks_open_overlaps_as_one_does():
     shared = pctt.Simulation(soft_bed(), overlap="relax", tol=1e-8)
     assert shared.positions == pytest.approx(alone.positions, abs=1e-5)
     assert shared.velocities == pytest.approx(alone.velocities, abs=1e-12)
+
+
+def test_places_alone_take_the_radius_that_is_given(tmp_path):
+    found = read_spheres(written(tmp_path, "0 0 1\n0 2 3\n"), density=1200.0, radius=0.1)
+    assert found["positions"].tolist() == [[0, 0, 1], [0, 2, 3]]

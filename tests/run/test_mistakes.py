@@ -11,6 +11,7 @@ import pytest
 from mpi4py import MPI
 
 import pctt
+from dem.together import SceneError
 from pctt import Box, Dynamic, Fixed, Glide, Mesh, Plane, Rotation, Scene, Simulation, measures
 from pctt.disk import FileError
 from pctt.options import OptionError
@@ -53,7 +54,10 @@ def test_what_is_no_region_is_refused():
         measures.mixing(sim.sample, whole, tube, (2, 2, 2))
     with pytest.raises(ValueError, match=r"region of an outlet: allowed .*, got Box\(half_extents"):
         falling().add_outlet("out", Box((1, 1, 1)))
-    assert measures.mixing(sim.sample, whole, block, (2, 2, 2))
+    with pytest.raises(TypeError, match="measures.stress: allowed is a Sample, such as sim.sample, got Simulation"):
+        measures.stress(sim, block)
+    with pytest.warns(UserWarning, match="the mask has every grain of the region"):
+        measures.mixing(sim.sample, whole, block, (2, 2, 2))
 
 
 def test_an_attribute_that_a_simulation_does_not_have_is_not_set():
@@ -128,6 +132,13 @@ def in_millimetres():
     return scene
 
 
+def tooled(density=1000.0, anchor=(0, 0, 3)):
+    scene = floored()
+    scene.add_body("arm", [Box((0.5, 0.1, 0.1))], Dynamic(), density=density, position=(0, 0, 2))
+    scene.add_joint("axle", "arm", anchor=anchor)
+    return scene
+
+
 def hung():
     scene = bare()
     scene.add_spring("rope", None, 0, stiffness=10.0)
@@ -143,12 +154,15 @@ def drained():
 @pytest.mark.parametrize(("scene", "words"), [
     (floored(density=2.5), "a density of 2.5 kg/m.3: is it in g/cm.3"),
     (poured(), "a density of 2.5 kg/m.3: is it in g/cm.3"),
+    (tooled(density=7.8), "a density of 7.8 kg/m.3: is it in g/cm.3"),
+    (tooled(anchor=(0, 800, 0)), "an anchor of the joint 'axle' is 800 m away from 'arm': is it in mm"),
     (floored(friction=30.0), "friction 30: is it an angle in degrees"),
     (floored(static_friction=26.6), "friction 26.6: is it an angle in degrees"),
     (in_millimetres(), "the mesh of 'wheel' is 200 m long: is it in mm, scale=1e-3"),
     (bare(), "the grains fall for ever, as no part of a large body is below them: a floor is"),
     (walled(), "the grains fall for ever"),
     (floored(stiffness=1.0), "contacts are so soft that .* half thicknesses. What helps: a larger stiffness="),
+    (tooled(), ""),
     (floored(), ""), (floored(friction=1e6), ""), (hung(), ""), (drained(), ""), (bare(gravity=(0, 0, 0)), ""),
 ])  # fmt: skip
 def test_what_is_likely_a_mistake_is_told_before_the_first_step(scene, words):
@@ -330,3 +344,31 @@ def test_messages_speak_python(tmp_path):
         sim.save(tmp_path / "mixer.h5")
     with pytest.raises(OptionError, match=f"^n 2: {tmp_path}/mixer.h5 was made with n 1; allowed is the same"):
         Simulation.load(tmp_path / "mixer.h5", Mixer(n=2))
+
+
+@pytest.mark.parallel(2)
+def test_other_calls_on_other_ranks_are_told():
+    sim, first = Simulation(falling(), dt=0.01), MPI.COMM_WORLD.rank == 0
+    with pytest.raises(SceneError, match="rank 0 at step of a Simulation, rank 1 at position of a Simulation"):
+        sim.step() if first else sim.positions
+    sim.step()
+    whole = measures.Block((0, 0, 0), (1, 1, 1))
+    with pytest.raises(SceneError, match="rank 0 at a measure, rank 1 at change of a Simulation"):
+        measures.fabric(sim.sample, whole) if first else sim.change("body floor", motion=Fixed())
+
+
+def test_a_source_that_never_has_room_is_told_once():
+    scene = floored()
+    for name, low in (("buried", -2.0), ("rain", 1.0)):
+        region = measures.Block((0, 0, low), (1, 1, low + 1))
+        scene.add_source(name, region, radius=0.05, density=1500.0, number_rate=1e3, most=3)
+    sim = Simulation(scene, dt=1e-3)
+    with pytest.warns(UserWarning, match="source 'buried' makes no grain in 100 steps") as told:
+        sim.run(steps=110)
+    assert [sim.source(name).count for name in ("buried", "rain")] == [0, 3]
+    assert sum("makes no grain" in str(each.message) for each in told) == 1
+
+
+def test_files_go_to_a_folder_that_is_named():
+    with pytest.raises(OptionError, match=r"write\(''\): allowed is the name of a folder"):
+        Simulation(falling()).write("")

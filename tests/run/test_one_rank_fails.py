@@ -108,7 +108,7 @@ CASES = [
         UNEQUAL_CALLS,
         (
             "SceneError",
-            "the code of a scene must make the same calls on all ranks, but rank 0 at Step.total, rank 1 at the end "
+            "a program must make the same calls on all ranks, but rank 0 at Step.total, rank 1 at the end "
             "of the record of the scene One, rank 2 at the end of the record of the scene One",
         ),
     ),
