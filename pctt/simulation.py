@@ -43,7 +43,7 @@ from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.start import step_remark
 from dem.start.doubts import RoomWatch, doubts
 from dem.start.time_step import fall_remark, reason, smallest
-from dem.start.tools import PaceWatch, SwingWatch
+from dem.start.tools import PaceWatch, SwingWatch, half_turn_remark
 from dem.start.turns import TurnWatch
 from dem.step import Step
 from dem.step.impulses import ImpulseMemory
@@ -146,7 +146,8 @@ class Simulation:
         if idle is not None:
             warn(comm, f"overlap={idle!r} has no effect, as the simulation goes on from a checkpoint")
         falls = "" if restart else comm.bcast(fall_remark(scene, self.settings.dt))
-        if large := step_remark(self.world, self.settings.dt) or falls:
+        turned = [half_turn_remark(body, self.settings.dt) for body in self.world.large_bodies]
+        if large := step_remark(self.world, self.settings.dt) or falls or next(filter(None, turned), ""):
             warn(comm, large)
         if likely := "" if restart else comm.bcast(doubts(scene)):
             warn(comm, likely)

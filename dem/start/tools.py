@@ -44,6 +44,16 @@ def top_speed(body: LargeBody, point: Floats, radius: Floats, step: float) -> fl
     return float(np.linalg.norm(velocity[:, :3], axis=1).max()) + turning
 
 
+def half_turn_remark(body: LargeBody, dt: float) -> str:
+    """What to say of a dt [s] in which the motion of a large body turns it by more than half a turn, as the shortest
+    way from pose to pose is another one then; empty if it does not. Of motions of one's own nothing is known."""
+    spin = 0.0 if _is_own(body) else float(np.linalg.norm(body.motion.top_velocity()[3:]))
+    if dt * spin <= np.pi:
+        return ""
+    turns = f"{body.name} turns by {dt * spin:.3g} rad in a step"
+    return f"dt {dt:g} s is too large: {turns}; take less than {np.pi / spin:.2g} s"
+
+
 def greatest_speed(velocity: Floats, center: Floats, point: Floats, radius: Floats) -> float:
     """The greatest speed [m/s] within `radius` (n,) of the points (n, 3) [m] of a body which moves and turns about
     `center` (3,) with `velocity` (6,) for ever: points keep their distances from the axis, by which they go fast."""

@@ -383,7 +383,7 @@ def test_few_calls_lie_between_a_solve_and_a_product_of_its_matrix(solver, form,
 
     def noted(*given):
         names = [(Path(frame.filename).parent.name, frame.name) for frame in traceback.extract_stack()]
-        depths.append(len(names) - names.index(("ccp", "solve")) - 1)  # without this one
+        depths.append(len(names) - names.index(("ccp", "solved")) - 1)  # without this one
         product(*given)
 
     monkeypatch.setattr(Shell, "mult", noted)

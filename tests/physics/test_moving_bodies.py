@@ -217,3 +217,12 @@ def test_a_tool_that_a_run_lets_swing_too_fast_is_told(change):
         sim.change("body plate", **change)
         with pytest.warns(UserWarning, match="plate swings with about [23].* take at most 0.000"):
             sim.run(until=0.6)
+
+
+def test_half_a_turn_in_a_step_is_told():
+    """200 rad/s are no turn in pi / 100 s: the grain would see a tool at rest."""
+    with pytest.warns(UserWarning, match="plate turns by 6.28 rad in a step; take less than 0.016 s"):
+        pctt.Simulation(moved_by(Rotation((0, 0, 200.0))), dt=np.pi / 100.0, comm=MPI.COMM_SELF)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*rad in a step")
+        pctt.Simulation(moved_by(Rotation((0, 0, 200.0))), dt=0.015, comm=MPI.COMM_SELF)
