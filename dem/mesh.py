@@ -45,6 +45,12 @@ class Cells(NamedTuple):
     triangle: Ints  #: (start[-1],)
 
 
+def _unit(vector: Floats) -> Floats:
+    """Vectors (..., 3) over their lengths; zero where these are."""
+    size = length(vector)[..., None]
+    return vector / np.where(size > 0.0, size, 1.0)
+
+
 class Surface:
     """Triangles with the edges and vertices that they share, and cells in which they are found.
 
@@ -79,15 +85,17 @@ class Surface:
         self._cells: dict[int, Cells] = {}
 
     @cached_property
-    def around(self) -> tuple[Ints, Ints]:
-        """The vertices around edges and vertices (start, vertex), in the order of features without the triangles: the
-        corners opposite an edge, and the other ends of the edges at a vertex."""
-        count = len(self.edge)
-        opposite = np.roll(self.triangle, 1, axis=1)  # the edge from corner k is opposite corner k + 2
+    def around(self) -> tuple[Ints, Floats]:
+        """The ways around edges and vertices (start, unit vectors), in the order of features without the triangles:
+        from an edge across its triangles, from a vertex along the edges that end there."""
+        count, along = len(self.edge), _unit(np.roll(self.corner, -1, axis=1) - self.corner)
+        across = np.roll(self.corner, 1, axis=1) - self.corner  # the edge from corner k is opposite corner k + 2
+        across -= np.einsum("mki,mki->mk", across, along)[:, :, None] * along
+        ends = _unit(self.vertex[self.edge[:, 1]] - self.vertex[self.edge[:, 0]])
         of = np.concatenate([self.side.ravel(), count + self.edge[:, 0], count + self.edge[:, 1]])
-        vertex = np.concatenate([opposite.ravel(), self.edge[:, 1], self.edge[:, 0]])
+        way = np.concatenate([_unit(across).reshape(-1, 3), ends, -ends])
         start = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=count + len(self.vertex)))])
-        return start, vertex[np.argsort(of, kind="stable")]
+        return start, way[np.argsort(of, kind="stable")]
 
     @cached_property
     def loose(self) -> Bools:

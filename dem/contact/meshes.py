@@ -116,15 +116,14 @@ def _feet(ball: Spheres, delta: Floats, surface: Surface) -> SurfaceContacts:
     center, radius = ball
     row, triangle = surface.near(center, radius + delta)
     found = surface.closest(center[row], triangle)
-    corners = surface.vertex, *surface.around
-    least, away = _least_around(center, radius + delta, row, triangle, found[:], surface.normal, corners)
+    least, away = _least_around(center, radius + delta, row, triangle, found[:], surface.normal, surface.around)
     chosen = _one_for_each(row, triangle, found, least, radius, surface)
     row, gap = row[least], found.distance[least] - radius[row[least]]
     return SurfaceContacts(row, found.feature[least], found.point[least], away, gap).take(chosen)
 
 
 @loop
-def _least_around(center, reach, row, triangle, found, normal, corners):
+def _least_around(center, reach, row, triangle, found, normal, around):
     """Of the closest points of triangles (m,) to the centres of these rows (m,) of balls those (k,) that are within
     reach, and least around them: one for each ball and feature, in their order; and the directions (k, 3) from there to
     the centres."""
@@ -146,7 +145,7 @@ def _least_around(center, reach, row, triangle, found, normal, corners):
             x, y, z = plus(vector_of(center[row[n]], 0), -1.0, vector_of(point[n], 0))
             x, y, z = x / size, y / size, z / size
         rim = feature[n] - faces
-        if size > 0.0 and rim >= 0 and not _is_least(corners, rim, vector_of(point[n], 0), (x, y, z), ROUNDING):
+        if size > 0.0 and rim >= 0 and not _is_least(around, rim, (x, y, z), ROUNDING):
             continue
         for k in range(count, at, -1):
             least[k], away[k] = least[k - 1], away[k - 1]
@@ -156,31 +155,29 @@ def _least_around(center, reach, row, triangle, found, normal, corners):
 
 
 @inlined
-def _is_least(corners, rim, place, away, slack):
+def _is_least(around, rim, away, slack):
     """Whether a place on an edge or at a vertex, number `rim` of both, is closer to what is in the direction `away`
-    than others of the surface around it. `corners` are the vertices and `Surface.around`."""
-    vertex, start, other = corners
-    for e in range(start[rim], start[rim + 1]):
-        offset = plus(vector_of(vertex[other[e]], 0), -1.0, place)
-        if product(offset, away) > slack * np.sqrt(product(offset, offset)):
+    than others of the surface `Surface.around` it."""
+    start, way = around
+    for e in range(start[rim], start[rim + 1]):  # noqa: SIM110 - all() of a generator is not compiled
+        if product(vector_of(way[e], 0), away) > slack:
             return False
     return True
 
 
-def within_cone(surface: Surface, feature: Ints, point: Floats, away: Floats, slack: float) -> Bools:
-    """Which points (k, 3) of features (k,) are closest, among those of the surface around them, to what is in the
-    direction `away` (k, 3) from them; always those over faces."""
-    corners = surface.vertex, *surface.around
-    inside: Bools = _are_least(corners, feature - len(surface.triangle), point, away, slack)
+def within_cone(surface: Surface, feature: Ints, away: Floats, slack: float) -> Bools:
+    """Which places on features (k,) are closest, among those of the surface around them, to what is in the direction
+    `away` (k, 3) from them; always those over faces."""
+    inside: Bools = _are_least(surface.around, feature - len(surface.triangle), away, slack)
     return inside
 
 
 @loop
-def _are_least(corners, rim, point, away, slack):
+def _are_least(around, rim, away, slack):
     """The loop of `within_cone`; over faces `rim` is negative."""
     inside = np.empty(len(rim), np.bool_)
     for n in range(len(rim)):
-        inside[n] = rim[n] < 0 or _is_least(corners, rim[n], vector_of(point[n], 0), vector_of(away[n], 0), slack)
+        inside[n] = rim[n] < 0 or _is_least(around, rim[n], vector_of(away[n], 0), slack)
     return inside
 
 
@@ -189,10 +186,9 @@ def flat_across(surface: Surface, feature: Ints, away: Floats) -> Bools:
     feature, faces = feature % surface.features, len(surface.triangle)
     flat: Bools = feature < faces
     rim = np.flatnonzero(~flat & (feature < faces + len(surface.edge)))
-    edge, (start, vertex) = feature[rim] - faces, surface.around
-    row, entry = spread(start, edge)
-    offset = surface.vertex[vertex[entry]] - surface.vertex[surface.edge[edge[row], 0]]
-    flat[rim[row[np.abs(dot(offset, away[rim[row]])) <= TILT * length(offset)]]] = True
+    start, way = surface.around
+    row, entry = spread(start, feature[rim] - faces)
+    flat[rim[row[np.abs(dot(way[entry], away[rim[row]])) <= TILT]]] = True
     return flat
 
 
@@ -269,7 +265,7 @@ def _from_core(
     away = away / np.where(distance > 0.0, distance, 1.0)[:, None]
     found = SurfaceContacts(row, feature + 2 * surface.features, point, away, distance - radius[row])
     near = np.flatnonzero((distance > 0.0) & (distance <= reach[row]))
-    return found.take(near[within_cone(surface, feature[near], point[near], away[near], slack)])
+    return found.take(near[within_cone(surface, feature[near], away[near], slack)])
 
 
 def _through_faces(row: Ints, triangle: Ints, core: Capsules, surface: Surface) -> SurfaceContacts:

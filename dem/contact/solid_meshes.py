@@ -94,7 +94,7 @@ def _on_ridges(
     own, edge, name, touch = own[pair[keep]], edge[pair[keep]], name[keep], touch.take(keep)
     away, place = -touch.normal, touch.point + 0.5 * touch.gap[:, None] * touch.normal
     found = SurfaceContacts(own, _feature_at(place, edge, SNAP * body.thick[own], surface), place, away, touch.gap)
-    least = within_cone(surface, found.feature, place, away, ROCKING)
+    least = within_cone(surface, found.feature, away, ROCKING)
     least &= _beside(row, triangle, found, body.thick, surface)
     return _named(found, name, least, body, surface)
 

@@ -150,9 +150,9 @@ def test_spheres_keep_their_energy_on_tools_that_move(motion):
     assert errors[1] < 0.35 * errors[0]
 
 
-def swings(scene):
+def swings(scene, **settings):
     """The angles at which the one grain of a scene turns about on the side where it began, over that of the start."""
-    sim, angles = pctt.Simulation(scene), []
+    sim, angles = pctt.Simulation(scene, **settings), []
     x = sim.positions[0]
     start = np.arctan2(x[0], -x[2])
     while sim.time < 4.4 * np.pi * np.sqrt(0.45 / G):
@@ -172,9 +172,10 @@ def test_a_sphere_swings_in_a_bowl_of_triangles():
     assert 0.96 < second < first < 1.0
 
 
-@pytest.mark.parametrize("shape", ["along", "across", "box"])
-def test_other_shapes_swing_in_a_trough_of_triangles(shape):
-    """Each corner and end finds its own direction at the start."""
+@pytest.mark.parametrize(("shape", "settings"), [("along", {}), ("across", {}), ("box", {}), ("box", {"dt": 0.005})])
+def test_other_shapes_swing_in_a_trough_of_triangles(shape, settings):
+    """Each corner and end finds its own direction at the start. The triangles are 300 times as long as wide: what their
+    edges hold is asked across these; else the sides of a box catch on them, and 0.6 to 1.1 of the angle is left."""
     count, a = 400, np.linspace(-1.3, 1.3, 400)
     corners = [np.stack([0.5 * np.sin(a), np.full(count, y), -0.5 * np.cos(a)], axis=1) for y in (-0.5, 0.5)]
     k = np.arange(count - 1)
@@ -190,6 +191,6 @@ def test_other_shapes_swing_in_a_trough_of_triangles(shape):
     else:
         turn = [np.cos(np.pi / 4 - 0.3), 0.0, np.sin(np.pi / 4 - 0.3), 0.0] if shape == "across" else lying
         scene.add_capsules(place, 0.05, 0.08, DENSITY, quaternions=[turn])
-    first, second = swings(scene)[:2]
+    first, second = swings(scene, **settings)[:2]
     assert 0.97 < first < 1.01
     assert 0.95 < second < first
