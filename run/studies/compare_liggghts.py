@@ -508,7 +508,7 @@ def main() -> None:
     line.add_argument("n", type=int, nargs="*", help="sizes of the mixer (4 8 16, with --cores 32 as well)")
     line.add_argument("--seconds", type=shared.listed(float), help="simulated, of each (3,3,1.2; --cores 1,1,0.2,0.05)")
     line.add_argument("--cores", action="store_true", help="one rank and two, by the clock")
-    line.add_argument("--starts", type=shared.listed(shared.at_least_one), default="2", help="of each (2)")
+    line.add_argument("--starts", type=shared.listed(shared.at_least_one), default="2,2,1", help="of each (2,2,1)")
     usual = "1e7,1e8"
     line.add_argument("--stiffness", type=shared.listed(float), default=usual, help=f"of LIGGGHTS [N/m] ({usual})")
     line.add_argument("--ours", nargs="+", default=OURS, help="settings, see above")
