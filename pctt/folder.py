@@ -19,7 +19,6 @@ From these follow, at the end of a run or by `Folder.derive`:
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,7 +31,7 @@ from mpi4py import MPI
 
 from dem import bodies
 from dem.arrays import Tabular
-from pctt import disk
+from pctt import disk, json_text
 from pctt.disk import FileError, same_rows, write_text
 
 #: The columns of the bodies: where they are, and what they are; those of the latter but ids are in bodies.h5.
@@ -59,33 +58,6 @@ LINKS = (
     "This file holds nothing but links to the folder frames beside it, and is empty without that folder. "
     "python -m pctt.export FOLDER -single FILE.h5 makes one file of all."
 )
-
-
-# -- figures as JSON, which has no infinity and no NaN: they are written as null -------------------------------
-
-
-def dumps(figures: Any, indent: int | None = None) -> str:
-    """Return the JSON text of figures: numbers, and dicts and lists of them."""
-    def text(figures: Any) -> str:
-        return json.dumps(figures, indent=indent, allow_nan=False, default=lambda number: number.item())  # of numpy
-
-    try:
-        return text(figures)
-    except ValueError:  # a number is not finite
-        return text(_finite(figures))
-
-
-def loads(line: str) -> dict[str, Any]:
-    """Return the figures of a JSON text by name; null becomes infinity. ValueError if the text is not JSON."""
-    return {name: math.inf if value is None else value for name, value in json.loads(line).items()}
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def totals(steps: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -263,8 +235,8 @@ class Folder:
         self.shape, self.size, self.mass, self.material = found[:4]
         #: names of the materials by their numbers; name and shapes of each large body, the rows after the grains
         self.materials: list[str] = [name.decode() for name in found[4]]
-        self.large: list[dict[str, Any]] = json.loads(found[5])
-        self.forms: list[dict[str, Any]] = json.loads(found[6])
+        self.large: list[dict[str, Any]] = json_text.read(found[5])
+        self.forms: list[dict[str, Any]] = json_text.read(found[6])
         self.grains = len(self.shape) - len(self.large)
 
     @property
@@ -312,7 +284,7 @@ class Folder:
         """
         path = self.path / "steps.jsonl"
         try:
-            return [loads(line) for line in disk.lines(path)]
+            return [json_text.figures(line) for line in disk.lines(path)]
         except (OSError, ValueError) as error:
             raise FileError(f"{path}: no list of steps ({error})") from None
 
@@ -345,7 +317,7 @@ class Folder:
         """A file's contents; nothing if there is none. FileError if it is no JSON."""
         path = self.path / name
         try:
-            return json.loads(path.read_text()) if path.exists() else {}
+            return json_text.read(path.read_text()) if path.exists() else {}
         except (OSError, ValueError) as error:
             raise FileError(f"{path}: no figures ({error})") from None
 
@@ -363,7 +335,7 @@ class Folder:
         lines = self.lines()
         if lines:
             write_table(self.path / "records.csv", _records(lines))
-        write_text(self.path / "summary.json", dumps(self._summary(lines, **more), indent=1) + "\n")
+        write_text(self.path / "summary.json", json_text.written(self._summary(lines, **more), indent=1) + "\n")
         if self.steps:
             self._link()
 
@@ -371,7 +343,7 @@ class Folder:
         """Let state.h5 lead to all recorded steps."""
         self.require_frames()
         with disk.whole(self.path / "state.h5") as temporary, disk.hdf5(temporary) as file:
-            file.attrs["scene"] = json.dumps(self._json("settings.json").get("scene", {}))
+            file.attrs["scene"] = json_text.written(self._json("settings.json").get("scene", {}))
             file.attrs["large_bodies"] = [body["name"] for body in self.large]
             file.attrs["contents"], file.attrs["links"] = CONTENTS, LINKS
             file["bodies"] = h5py.ExternalLink("frames/bodies.h5", "/")

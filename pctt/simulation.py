@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 import html
-import json
 import math
 from collections.abc import Callable
 from functools import partial, wraps
@@ -49,7 +48,7 @@ from dem.step import Step
 from dem.step.impulses import ImpulseMemory
 from dem.together import barrier, together
 from dem.unconstrained.loose import LooseWatch
-from pctt import ccp, log
+from pctt import ccp, json_text, log
 from pctt.disk import FileError
 from pctt.folder import Contacts, Frame, Snapshot, Table
 from pctt.options import OptionError, made, nearest, refuse_bad
@@ -538,7 +537,7 @@ class Simulation:
             if path:
                 refuse_unwritable(name, Path(path), self.comm)
         place = Place(Path(folder), self.comm, self.restart, overwrite, self._program)
-        about = {"scene": json.loads(self._origin["scene"]), "settings": dataclasses.asdict(self.settings)}
+        about = {"scene": json_text.read(self._origin["scene"]), "settings": dataclasses.asdict(self.settings)}
         about["stiffness"] = self.world.pairs.stiffness.tolist()
         self.output = Writer(place, self.world, about, self._save, self._compare.summary, run)
         self.stepper.dump = Dump(self.settings, self.experiment, self.world, place, hard, str(problems))

@@ -98,7 +98,7 @@ BELOW = {
         "pctt.disk", "dem.exchange", "dem.geometry.morton", "pctt.options", "pctt.petsc",
         "pctt.tt",
     },
-    "pctt.folder": {"dem", "pctt.disk"},
+    "pctt.folder": {"dem", "pctt.disk", "pctt.json_text"},
     "pctt.scenes": {"dem"},
     "pctt.analysis": {"dem", "pctt.disk", "pctt.folder"},
     "pctt.look": {"dem", "pctt.disk", "pctt.folder", "pctt.options", "pctt.petsc"},

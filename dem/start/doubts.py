@@ -71,7 +71,7 @@ def _bottomless(scene: Scene) -> str:
     """Of grains that gravity drives, and that nothing can stop: neither a surface, nor what holds them or takes them
     away."""
     weight = math.hypot(*scene.gravity)
-    held = any(scene.named.values()) or scene.passages.removes or scene.cell.periodic
+    held = any(scene.named.values()) or scene.passages.removes or scene.cell.axes[scene.gravity != 0.0].any()
     if not weight or held or not scene.count or any(map(len, ends(scene, scene.gravity / weight))):
         return ""
     return "the grains fall for ever, as no part of a large body is below them: a floor is Plane((0, 0, 1))"

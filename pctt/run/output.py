@@ -6,7 +6,6 @@ leaves whole files, and what is written per step does not grow with the number o
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
@@ -30,9 +29,9 @@ from dem.scene import least_half
 from dem.shapes import described
 from dem.step import Step
 from dem.together import together
-from pctt import disk
+from pctt import disk, json_text
 from pctt.disk import FileError, Lock, on_first, texts, write_rows, write_text
-from pctt.folder import DERIVED, FILES, HARD, PLACES, TABLE, Folder, dumps, write_table
+from pctt.folder import DERIVED, FILES, HARD, PLACES, TABLE, Folder, write_table
 from pctt.options import OptionError
 from pctt.petsc import warn
 from pctt.run.settings import Run
@@ -176,7 +175,7 @@ class Writer:
         """The steps that stay of an earlier run, and their lines; FileError if a line is damaged."""
         for number, line in enumerate(disk.lines(self._lines), 1):
             try:
-                step = int(json.loads(line)["step"])
+                step = int(json_text.read(line)["step"])
             except (LookupError, TypeError, ValueError) as error:
                 words = f"line {number} is no step ({error}); delete it, and the run goes on with the others"
                 raise FileError(f"{self._lines}: cannot be continued: {words}") from None
@@ -199,10 +198,10 @@ class Writer:
             table = frames / "bodies.h5"
             if not on_first(self.comm, table, lambda: self.place.goes_on and table.exists()):  # of the first frame
                 rows = _by_id(world, TABLE[1:])
-                large = np.bytes_(json.dumps(described_bodies(world)))
+                large = np.bytes_(json_text.written(described_bodies(world)))
                 shared = {"materials": texts(world.materials), "large": large}
                 if world.forms:
-                    shared["forms"] = np.bytes_(json.dumps(described_forms(world)))
+                    shared["forms"] = np.bytes_(json_text.written(described_forms(world)))
                 write_rows(table, self.comm, rows, shared, {})
         near, count = contacts.near.bodies, contacts.near.grains
         start = near.position[:count], near.position[count + contacts.near.ghosts :]
@@ -225,7 +224,7 @@ class Writer:
 
     def add(self, line: Mapping[str, Any], row: Mapping[str, float]) -> None:
         """Write the figures of a step with the row of its records, and the checkpoint if that is due."""
-        due = on_first(self.comm, self._lines, lambda: self._add(dumps({**line, "record": row})))
+        due = on_first(self.comm, self._lines, lambda: self._add(json_text.written({**line, "record": row})))
         if due:  # after the figures: a run that goes on from the checkpoint must find the step
             self._checkpoint()
         if not self._stands:
@@ -247,7 +246,7 @@ class Writer:
         return (self._world.step - self._start) % self._run.checkpoint_every == 0
 
     def _begin(self, line: str) -> None:
-        write_text(self.place.now / "settings.json", dumps(self._about, indent=1) + "\n")
+        write_text(self.place.now / "settings.json", json_text.written(self._about, indent=1) + "\n")
         with disk.whole(self._lines) as temporary, open(temporary, "w") as file:
             file.writelines(f"{text}\n" for text in chain((text for _, text in self._kept()), [line]))
         self._begun = True
@@ -321,7 +320,7 @@ def described_bodies(world: World) -> list[dict[str, Any]]:
         {"name": body.name, "shapes": [described(shape) for shape in body.shapes]}
         for body in world.large_bodies
     ]
-    return json.loads(json.dumps(large, default=list))  # arrays as lists
+    return json_text.read(json_text.written(large))  # arrays as lists
 
 
 def described_forms(world: World) -> list[dict[str, Any]]:

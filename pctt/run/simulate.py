@@ -14,7 +14,7 @@ from pctt.arrays import Array
 from pctt.ccp import fclib
 from pctt.ccp.fclib import FileFormatError, Stored
 from pctt.disk import FileError, on_first, write_text
-from pctt.folder import dumps
+from pctt.json_text import written
 from pctt.ksp_options import remark
 from pctt.options import OptionError
 from pctt.run import interrupt, report
@@ -153,7 +153,7 @@ def solve_file(options: Options, comm: MPI.Comm) -> None:
     try:
         place.make()
         path = place.now / "summary.json"
-        on_first(comm, path, lambda: write_text(path, dumps(summary, indent=1) + "\n"))
+        on_first(comm, path, lambda: write_text(path, written(summary, indent=1) + "\n"))
         place.take()
     finally:
         place.leave()

@@ -30,7 +30,7 @@ from dem.shapes import placed
 from dem.start import even_slice, new_world, refuse_overlap, restart_rows, restored_world, stiffness, time_step
 from dem.step.impulses import ImpulseMemory
 from dem.together import SceneError, first_differing_rank, together
-from pctt import ccp
+from pctt import ccp, json_text
 from pctt.disk import FileError, Lock, on_first, read, same_rows, texts, write_rows
 from pctt.options import OptionError
 from pctt.petsc import warn
@@ -221,7 +221,7 @@ def load(
         old = {name: file.attrs[name] for name in made_with if name != "figures"}
         old["figures"] = file.attrs.get("figures", made_with["figures"])  # older files have none
         impulses = tuple(file[name][contacts] for name in CONTACTS)
-        return old, json.loads(file.attrs["scene"]), replicated, changed, local, impulses
+        return old, json_text.read(file.attrs["scene"]), replicated, changed, local, impulses
 
     old, scene_of, replicated, changed, local, impulses = read(path, comm, take)
     _refuse_other_origin(path, old, scene_of, made_with, program)
@@ -250,7 +250,7 @@ def _refuse_other_origin(
     path: Path, old: dict[str, Any], old_scene: dict[str, Any], new: dict[str, Any], program: bool
 ) -> None:
     """OptionError for the first option in which two origins differ."""
-    new_scene = json.loads(new["scene"])
+    new_scene = json_text.read(new["scene"])
     pairs = [("-scene" if program else "scene", old_scene["scene"], new_scene["scene"])]
     absent = "(no such option)"
     names = [name for name in {**new_scene, **old_scene} if name != "scene"]
@@ -266,7 +266,7 @@ def _tell_other_origin(path: Path, old: dict[str, Any], new: dict[str, Any], com
     def value(figures: dict[str, str], name: str) -> str:  # of a pair without coefficients of its own those of all
         return figures.get(name, figures.get(name.partition(" of ")[0], "none"))
 
-    before, now = json.loads(old["figures"]), json.loads(new["figures"])
+    before, now = json_text.read(old["figures"]), json_text.read(new["figures"])
     names = [name for name in {**now, **before} if before.get(name) != now.get(name)]
     if names:
         differences = ", ".join(f"{name} {value(before, name)}, now {value(now, name)}" for name in names[:10])
@@ -283,7 +283,7 @@ def _tell_other_origin(path: Path, old: dict[str, Any], new: dict[str, Any], com
 def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_with: dict[str, Any]) -> Path:
     """The file of a scene's settled state. Its name has the scene and a digest of all that influences the state: of a
     run's settings that is ``settle_tol``. OptionError if the scene never settles."""
-    about = json.loads(made_with["scene"])
+    about = json_text.read(made_with["scene"])
     if not experiment.settling_time:
         raise OptionError(f"{scene_words(experiment)}: has no settling_time and so no settled state")
     how: dict[str, Any] = {
@@ -297,7 +297,7 @@ def settled_path(experiment: Experiment, settings: Settings, scene: Scene, made_
         how["overlap"] = settings.overlap
     if experiment.digest:
         how["file"] = experiment.digest  # a file that was changed may build another scene
-    if surfaces := json.loads(made_with["surfaces"]):
+    if surfaces := json_text.read(made_with["surfaces"]):
         how["surfaces"] = surfaces
     digest = hashlib.sha256((made_with["scene"] + json.dumps(how, sort_keys=True)).encode()).hexdigest()[:12]
     size = f"_n{about['n']}" if "n" in about else ""

@@ -126,6 +126,10 @@ def walled():
     return scene
 
 
+def repeated(*period):
+    return bare(period=period)
+
+
 def in_millimetres():
     scene = floored()
     scene.add_body("wheel", [Mesh.revolved([(0, 0), (100, 0), (100, 50)], 8)], Rotation((0, 0, 1)), position=(0, 0, 99))
@@ -161,6 +165,8 @@ def drained():
     (in_millimetres(), "the mesh of 'wheel' is 200 m long: is it in mm, scale=1e-3"),
     (bare(), "the grains fall for ever, as no part of a large body is below them: a floor is"),
     (walled(), "the grains fall for ever"),
+    (repeated(1.0, 1.0, None), "the grains fall for ever"),
+    (repeated(None, None, 1.0), ""),  # they do, and are seen to
     (floored(stiffness=1.0), "contacts are so soft that .* half thicknesses. What helps: a larger stiffness="),
     (tooled(), ""),
     (floored(), ""), (floored(friction=1e6), ""), (hung(), ""), (drained(), ""), (bare(gravity=(0, 0, 0)), ""),
