@@ -22,7 +22,7 @@ from dem.contact.primitives import Primitives, primitives
 from dem.contact_map import Halo
 from dem.exchange import on_any
 from dem.model.images import Images, images
-from dem.model.neighbourhood import Neighbourhood, neighbourhood
+from dem.model.neighbourhood import MOVING, Neighbourhood, neighbourhood
 from dem.parts.cell import Cell
 
 if TYPE_CHECKING:
@@ -103,6 +103,22 @@ def _constant(world: World) -> list[Any]:
 #: Columns of bodies that no step changes.
 CONSTANT = "id", "mass", "inertia", "material", "shape", "size"
 _COLUMNS = attrgetter(*CONSTANT)
+
+
+def shared(lists: Lists, near: Neighbourhood, before: World, world: World) -> Lists:
+    """Return the lists, which both worlds, that before a step and its trial, now have, as they have the first rows of
+    the table in the place of columns of their own, which take memory: these are the grains as they are, and any lists
+    that hold lead to the same contacts."""
+    new = lists is not before.lists
+    for name in (*CONSTANT, *MOVING) if new else MOVING:
+        column = getattr(near.bodies, name)[: near.grains]
+        if getattr(before.grains, name) is getattr(world.grains, name):
+            setattr(before.grains, name, column)
+        setattr(world.grains, name, column)
+    if new:
+        lists = lists.of(world)
+    before.lists = world.lists = lists
+    return lists
 
 
 @loop

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from dem.arrays import Ints
+from dem.arrays import Floats, Ints, Keys
 from dem.contact import Contacts, find_contacts
-from dem.contact.lists import CONSTANT
+from dem.contact.lists import shared
 from dem.exchange import reduced
 from dem.model.images import wrap
-from dem.model.neighbourhood import MOVING
 from dem.model.partition import rebalance
 from dem.model.world import World
 from dem.record.passage import insert_and_remove
@@ -53,6 +52,20 @@ class NewStep:
     figures: dict[str, Any]  #: the line of the step in steps.jsonl
     held: Array  #: (parts nc, 3) impulses with which springs begin the next step
     kept: Array  #: (nc, columns) what the laws of contact keep
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """What a step is tried with; a solution may show that it lacks something."""
+
+    free: UnconstrainedMotion
+    contacts: Contacts
+    eased: tuple[Keys, Floats] | None = None  #: contacts that bounce with a part of e alone
+    smooth: bool = False  #: impacts without friction
+    turned: int = 0  #: how often turned contacts were linearised
+    shown: int = 0  #: how often contacts have shown limits, or motors that are too weak
+    impulses: ImpulseMemory | None = None  #: those of the attempt before, of other contacts
+    before: ccp.Result | None = None  #: what the attempts before have cost
 
 
 class Stepper:
@@ -109,78 +122,87 @@ class Stepper:
 
     def _next_step(self, world: World) -> NewStep:
         """The paper's step: contacts that close within it act from its start, and no gap is negative at its end."""
-        given, result, eased, smooth, turned, shown = self.settings, None, None, False, 0, 0
-        found: ImpulseMemory | None = None  # what contacts of this step had, before there were others
-        guess: Array | None = None
+        attempt = self._begun(world)
+        while True:
+            system, problem, guess = self._assembled(world, attempt)
+            with problem:
+                result = self._solved(world, system, problem, guess, attempt.before)
+                velocity, again = self._tested(world, attempt, system, result)
+                files = {} if again else self._dumped(system, problem, guess, result)
+            if again is None:
+                break
+            del attempt, system, problem, guess, result, velocity  # before others take as much memory
+            attempt = again()
+        _refuse_squeezed(world, result)
+        with log.phase("advance"):
+            system.take_flow(world, attempt.contacts)
+            advance(world, attempt.free, attempt.contacts, velocity, system.kept(velocity, result.impulse))
+            step = Step(world, attempt.contacts, system, *system.parts(result.impulse))
+            held, kept = system.held_after(result.impulse), system.keep(world, result.impulse, result.momentum)
+        return NewStep(step, self._figures(world, problem.size, result, files), held, kept)
+
+    def _begun(self, world: World) -> _Attempt:
+        """The first attempt of a step."""
         with log.phase("search"):
             insert_and_remove(world)  # grains that leave, and those that are due
             wrap(world)  # into the periodic cell
             rebalance(world)
-            free = unconstrained(world, given.dt)  # gravity, spin, loads, springs, drives, motions
-            contacts = self._with_lists(world, in_order(world, find_contacts(world, given.delta, free), free))
-        while True:
-            with log.phase("assembly"):
-                last, kept = self._recalled(world, contacts)
-                system = ContactSystem(world, contacts, free, given.recovery_speed, last, eased, smooth, kept)
-                free = system.motion  # with the joints
-                if found is not None:
-                    guess, found = found.recall(system.key, system.frame, elsewhere=False)[0], None
-                guess = last if guess is None else guess
-                problem = cone_problem(system, world.comm)
-            with problem:
-                result = self._solved(world, system, problem, guess, result)
-                if not smooth and _locks(world, result):
-                    smooth = True
-                    continue
-                with log.phase("search"):  # bodies that meet unforeseen
-                    system.set_rate(world, result.momentum)
-                    velocity = system.velocity_with(result.momentum)  # v_free + M^-1 D g
-                    missed, turned = self._missed(world, system, velocity, turned)
-                with log.phase("assembly"):
-                    other = less = None
-                    if missed is None and shown < TRIES:  # limits reached, motors too weak
-                        other = system.refound(world, result.impulse, velocity)
-                        shown += other is not None
-                    if missed is other is None:  # impacts that would make energy
-                        less = system.eased(world, result.impulse, result.momentum)
-                if missed is other is less is None:
-                    files = self._dumped(system, problem, guess, result)
-                    break
-            found, guess, result = _remembered(world, system, result), None, result.cost
-            free, eased = other or free, less or eased
-            del system, problem, last, kept, velocity  # before others take as much memory
-            if missed is not None:
-                del contacts
-                with log.phase("search"):
-                    contacts = self._with_lists(world, missed())
-        _refuse_squeezed(world, result)
-        with log.phase("advance"):
-            system.take_flow(world, contacts)
-            advance(world, free, contacts, velocity, system.kept(velocity, result.impulse))
-            step = Step(world, contacts, system, *system.parts(result.impulse))
-            held, kept = system.held_after(result.impulse), system.keep(world, result.impulse, result.momentum)
-        return NewStep(step, self._figures(world, problem.size, result, files), held, kept)
+            free = unconstrained(world, self.settings.dt)  # gravity, spin, loads, springs, drives, motions
+            found = find_contacts(world, self.settings.delta, free)
+            return _Attempt(free, self._shared(world, in_order(world, found, free)))
 
-    def _with_lists(self, world: World, contacts: Contacts) -> Contacts:
-        """The contacts, whose lists and table of bodies take the place of those of both worlds: these take memory, any
-        lists that hold lead to the same contacts, and the first bodies of the table are the grains as they are."""
-        near, given, grains = contacts.near, self.world.grains, world.grains
-        new = contacts.lists is not self.world.lists
-        for name in (*CONSTANT, *MOVING) if new else MOVING:
-            column = getattr(near.bodies, name)[: near.grains]
-            if getattr(given, name) is getattr(grains, name):
-                setattr(given, name, column)
-            setattr(grains, name, column)
-        if new:
-            contacts = replace(contacts, lists=contacts.lists.of(world))
-        self.world.lists = world.lists = contacts.lists
-        return contacts
+    def _assembled(self, world: World, attempt: _Attempt) -> tuple[ContactSystem, ccp.ConeProblem, Array]:
+        """The contacts of an attempt, their cone problem, and a guess of its solution (parts nc, 3)."""
+        with log.phase("assembly"):
+            contacts, recovery = attempt.contacts, self.settings.recovery_speed
+            elsewhere = self._slabs is not world.slabs
+            guess, _, kept = self.memory.recall(contacts.key, contacts.frame, elsewhere)
+            system = ContactSystem(world, contacts, attempt.free, recovery, guess, attempt.eased, attempt.smooth, kept)
+            if attempt.impulses is not None:
+                guess = attempt.impulses.recall(system.key, system.frame, elsewhere=False)[0]
+            return system, cone_problem(system, world.comm), guess
 
-    def _recalled(self, world: World, contacts: Contacts) -> tuple[Array, Array]:
-        """The impulses (parts nc, 3) of the last step of these contacts, and what laws kept of them (nc, columns)."""
-        elsewhere = self._slabs is not world.slabs
-        impulse, _, kept = self.memory.recall(contacts.key, contacts.frame, elsewhere)
-        return impulse, kept
+    def _tested(
+        self, world: World, attempt: _Attempt, system: ContactSystem, result: ccp.Result
+    ) -> tuple[Array, Callable[[], _Attempt] | None]:
+        """The velocities (owned, 6) of a solution, and what makes the next attempt if they show that the problem lacks
+        something; collective. No result is kept for it: it takes memory while others are made."""
+        if not attempt.smooth and _locks(world, result):
+            return np.zeros((0, 6)), partial(replace, attempt, free=system.motion, smooth=True, before=result.cost)
+        other = less = None
+        with log.phase("search"):  # bodies that meet unforeseen
+            system.set_rate(world, result.momentum)
+            velocity = system.velocity_with(result.momentum)  # v_free + M^-1 D g
+            missed, turned = self._missed(world, system, velocity, attempt.turned)
+        with log.phase("assembly"):
+            if missed is None and attempt.shown < TRIES:  # limits reached, motors too weak
+                other = system.refound(world, result.impulse, velocity)
+            if missed is other is None:  # impacts that would make energy
+                less = system.eased(world, result.impulse, result.momentum)
+        if missed is other is less is None:
+            return velocity, None
+        more: dict[str, Any] = {
+            "free": other or system.motion,
+            "eased": less or attempt.eased,
+            "smooth": attempt.smooth,
+            "turned": turned,
+            "shown": attempt.shown + (other is not None),
+            "impulses": _remembered(world, system, result),
+            "before": result.cost,
+        }
+        if missed is None:
+            return velocity, partial(_Attempt, contacts=attempt.contacts, **more)
+        return velocity, partial(self._searched, world, missed, more)
+
+    def _searched(self, world: World, search: Callable[[], Contacts], more: dict[str, Any]) -> _Attempt:
+        """The attempt with the contacts of another search."""
+        with log.phase("search"):
+            return _Attempt(contacts=self._shared(world, search()), **more)
+
+    def _shared(self, world: World, contacts: Contacts) -> Contacts:
+        """The contacts, whose lists and table the worlds before and after the step share."""
+        lists = shared(contacts.lists, contacts.near, self.world, world)
+        return contacts if lists is contacts.lists else replace(contacts, lists=lists)
 
     def _solved(
         self, world: World, system: ContactSystem, problem: ccp.ConeProblem, guess: Array, before: ccp.Result | None
