@@ -1,6 +1,7 @@
 """Tests on several ranks, all those of one number of ranks in one start of mpiexec.
 
-`@pytest.mark.parallel(1, 2, 3)` runs a test on 1 and on 3 ranks, and on 2 among the slow tests. Its communicator is
+`@pytest.mark.parallel(1, 2, 3)` runs a test on 1 and on 3 ranks, and on 2 among the slow tests. Of a test with many
+variants three run on several ranks, and the others among the slow tests. Its communicator is
 `MPI.COMM_WORLD`; its argument `ranks`, if it has one, is the number. On one rank it is a test as any other. On more,
 the first such test that comes up starts `mpiexec -n 3 python -m pytest` with all tests on 3 ranks that were selected;
 every rank runs them in the same order and writes down how they ended, and the session that was started by hand reports
@@ -27,6 +28,7 @@ import pytest
 T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
 INSIDE = "--of-ranks"  # the option by which a pytest inside mpiexec knows the folder where it finds and leaves all
+VARIANTS = 3  # of a test on several ranks that are not slow
 ENDS = 12000  # characters of what mpiexec said that are shown of a rank that died
 
 
@@ -134,10 +136,19 @@ def mpirun(tmp_path: Path, request: pytest.FixtureRequest) -> Callable[..., str]
 # -- the session that was started by hand ----------------------------------------------------------------------
 
 
+@pytest.hookimpl(tryfirst=True)  # before slow tests are left out
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """What a test on several ranks needs is made inside mpiexec; here only its result is wanted. Files with such tests
     come last: then their loops are compiled, and workers that wait for ranks leave them the cores."""
     if not config.getoption(INSIDE):
+        variants: dict[tuple[str, int], list[pytest.Item]] = {}
+        for item in items:
+            if ranks_of(item) > 1 and not item.get_closest_marker("slow"):
+                variants.setdefault((item.nodeid.partition("[")[0], ranks_of(item)), []).append(item)
+        for alike in variants.values():
+            few = {i * len(alike) // VARIANTS for i in range(VARIANTS)}
+            for item in [item for i, item in enumerate(alike) if i not in few]:
+                item.add_marker(pytest.mark.slow)
         late = {item.path for item in items if item.get_closest_marker("mpi")}
         items.sort(key=lambda item: item.path in late)
         for item in items:
