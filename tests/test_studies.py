@@ -41,7 +41,7 @@ def test_pages_name_studies_that_there_are():
             assert (ROOT / "run" / name).exists() or (ROOT / "pctt" / "run" / name).exists(), f"{page}: run/{name}"
 
 
-QUICK = ["trains ranks 1 -caps 10 -every 12", "trains reuse 1 -steps 2", "trains scaling 1", "ranks unfoldings 1"]
+QUICK = ["trains ranks 1 -caps 10 -every 12", "ranks unfoldings 1"]
 
 
 @pytest.mark.parametrize("words", QUICK)
@@ -55,7 +55,8 @@ def test_a_study_of_the_smallest_size_runs(words, tmp_path):
 #: Every other study at a small size, but those of other programs, which have to be there, and `convert_problems`, whose
 #: files tests/ccp/test_convert_problems.py has.
 SMALL = [
-    "measure steps 1", "measure preconditioners 1 -every 8 -names pbjacobi,tt", "measure laws 1", "measure paper -n 1",
+    "trains reuse 1 -steps 2", "trains scaling 1", "measure steps 1",
+    "measure preconditioners 1 -every 8 -names pbjacobi,tt", "measure laws 1", "measure paper -n 1",
     "measure pdip -n 1", "time_steps mixer4 --starts 1 --settings 6", "windows shear4 --states 1 --settings default "
     "--small dt=.005,tol=1e-3", "profile_problems tests/ccp/hard apgd conic --seconds 2 --laws convex",
     "cluster_model 2 -sizes 1,2 -copies 2,1,1", "cluster_start 12 -ranks 4 -of 0,3 -real 8 -steps 1",

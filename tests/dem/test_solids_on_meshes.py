@@ -197,7 +197,10 @@ def slid(floor, add):
     [
         lambda scene: scene.add_boxes([(-1, 0, 0.1)], (0.15, 0.1, 0.1), 1000.0, velocity=(2, 0.3, 0)),
         lambda scene: scene.add_polyhedra([(-1, 0, 0)], ROCK, 1000.0, velocity=(1.5, 0.3, 0)),
-        lambda scene: scene.add_grains([(-1, 0, 0.1)], Cylinder(0.15, 0.2), 1000.0, velocity=(2, 0.3, 0)),
+        pytest.param(
+            lambda scene: scene.add_grains([(-1, 0, 0.1)], Cylinder(0.15, 0.2), 1000.0, velocity=(2, 0.3, 0)),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["box", "polyhedron", "cylinder"],
 )

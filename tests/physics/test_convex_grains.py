@@ -34,7 +34,9 @@ def energies(scene, seconds):
         return first, sim.figures["kinetic_energy [J]"] + sim.figures["potential_energy [J]"]
 
 
-@pytest.mark.parametrize(("radius", "height", "tilt"), [(0.012, 0.002, 20.0), (0.1, 0.004, 15.0), (0.1, 0.02, 25.0)])
+@pytest.mark.parametrize(("radius", "height", "tilt"), [
+    (0.012, 0.002, 20.0), pytest.param(0.1, 0.004, 15.0, marks=pytest.mark.slow), (0.1, 0.02, 25.0)
+])
 def test_a_wobbling_coin_keeps_its_energy(radius, height, tilt):
     """It rolls on its rim, without slip: nothing brakes it."""
     tilt = np.radians(tilt)
@@ -47,8 +49,9 @@ def test_a_wobbling_coin_keeps_its_energy(radius, height, tilt):
     assert last == pytest.approx(first, rel=0.04)
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.7])
-@pytest.mark.parametrize("radii", [(0.06, 0.06, 0.012), (0.02, 0.02, 0.06), (0.15, 0.1, 0.06)])
+@pytest.mark.parametrize(
+    ("radii", "friction"), [((0.06, 0.06, 0.012), 0.7), ((0.02, 0.02, 0.06), 0.0), ((0.15, 0.1, 0.06), 0.7)]
+)
 def test_an_ellipsoid_that_topples_rises_again(radii, friction):
     """It presses with up to 36 times its weight on its way over its flat side; by the defaults."""
     scene, tilt = on_floor("plane", friction), 0.2

@@ -181,7 +181,7 @@ def test_a_motor_keeps_its_speed_and_is_changed_within_the_loop():
 
 @pytest.mark.parametrize(
     ("gravity", "strength", "seconds", "dt"),
-    [(0.0, 20.0, 1.5, 0.01), (0.0, 200.0, 0.5, 0.002), (G, 25.0, 4.0, 0.01), (G, 40.0, 1.5, 0.002)],
+    [(0.0, 200.0, 0.5, 0.002), (G, 25.0, 4.0, 0.01)],
 )
 def test_a_weak_motor_stops_at_its_target(gravity, strength, seconds, dt):
     """An arm of 1 m and 4 kg, which bears at most 19.6 N m by its weight, goes up to an angle without passing it."""

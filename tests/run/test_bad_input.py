@@ -207,9 +207,9 @@ def test_values_with_blanks_are_taken_whole(program, tmp_path):
     (problem,) = (tmp_path / "two  words").iterdir()
     said = refused(program, tmp_path / out, *options, "-output", out, own=True)
     assert f"-output {out}: holds a run" in said
-    program(*options, "-output", out, "-restart", f"{out}/checkpoint.h5", ranks=2, own=True)
+    program(*options, "-output", out, "-restart", f"{out}/checkpoint.h5", own=True)
     assert len(steps_of(tmp_path / out)) == 2
-    program("-problem", problem, "-output", "solved -overwrite", "-quiet", ranks=2, own=True)
+    program("-problem", problem, "-output", "solved -overwrite", "-quiet", own=True)
     assert summary_of(tmp_path / "solved -overwrite")
 
 
