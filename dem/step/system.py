@@ -233,8 +233,8 @@ class ContactSystem:
         return self._bounces | strikes
 
     def _bounce(self, world: World, freely: Floats, eased: tuple[Keys, Floats] | None, b: Floats) -> None:
-        """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton), see
-        `_parting`, by the normal numbers of b (nc, 3).
+        """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton),
+        see `_parting`, by the normal numbers of b (nc, 3).
 
         They begin if without impulses they close in the step, `freely` (nc,) [m/s], and come faster than `slowest`: a
         body at rest does not bounce."""
