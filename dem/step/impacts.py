@@ -76,6 +76,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     radius = np.ascontiguousarray(table.size[:, 0])
     surface, slow = np.zeros((0, 3)), np.zeros(len(contacts)) + dt * math.hypot(*world.gravity)
+    closing = np.zeros(len(contacts))
     if pairs.bounces:
         old = old.copy()
         old[grains:] = motion.prescribed
@@ -88,7 +89,7 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     if pairs.bounces:
         surface = _surfaces(contacts, old)
     kind, bounce, offset, marked, some = struck(
-        (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap,
+        (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap - dt * closing,
         (ball, table.mass, radius, table.material), (table.position, old, surface),
         (pairs.restitution, pairs.stiffness), grains, image, dt, slow,
     )  # fmt: skip
@@ -228,7 +229,7 @@ def struck(
         closed, closes, bounce[c] = gap[c] <= 0.0, linear[c] + dt * dot(v, n) < 0.0, e
         if ball[a] and b >= grains and e > 0.0 and np.isinf(mass[b]):
             v = surface[c, 0] - velocity[a, 0], surface[c, 1] - velocity[a, 1], surface[c, 2] - velocity[a, 2]
-            kind[c], meets[c] = WALL, closes and dot(v, n) < -slow[c]
+            kind[c], meets[c] = WALL, linear[c] + dt * dot(v, n) < 0.0 and dot(v, n) < -slow[c]
         elif ball[a] and ball[b] and (e > 0.0 or (many[a] == many[b] == 1 and _is_short(k, mass, a, b, dt))):
             offset[c] = image[c]
             time, speed = _meeting(_branch(place, a, b, offset, c), v, radius[a] + radius[b])

@@ -233,8 +233,8 @@ class ContactSystem:
         return self._bounces | strikes
 
     def _bounce(self, world: World, freely: Floats, eased: tuple[Keys, Floats] | None, b: Floats) -> None:
-        """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton), by
-        the normal numbers of b (nc, 3).
+        """Let contacts that begin within the step leave with e times the normal speed with which they came (Newton),
+        see `_parting`, by the normal numbers of b (nc, 3).
 
         They begin if without impulses they close in the step, `freely` (nc,) [m/s], and come faster than `slowest`: a
         body at rest does not bounce."""
@@ -253,7 +253,8 @@ class ContactSystem:
             place = places(eased[0], self.key)
             self._part[place >= 0] = eased[1][place[place >= 0]]
             e = e * self._part
-        b[begin, 0] = np.minimum(b[begin, 0], (e * came)[begin])
+        parts = _parting(e[begin], came[begin], (came - freely)[begin], contacts.linear_gap[begin], self.dt)
+        b[begin, 0] = np.minimum(b[begin, 0], -parts)
         self.compliance[begin] = 0.0
 
     def eased(self, world: World, impulse: Floats, momentum: Floats) -> tuple[Keys, Floats] | None:
@@ -402,6 +403,16 @@ class ContactSystem:
             return self.drives.impulse
         line, slip = self.drives.line, self.free_large - large
         return self.drives.impulse + (self.drives.servo_inertia * np.einsum("bi,bi->b", line, slip))[:, None] * line
+
+
+def _parting(e: Floats, came: Floats, pressed: Floats, gap: Floats, dt: float) -> Floats:
+    """The normal velocities (n,) in a step of dt [s] of contacts that bounce within it, and came with the velocities
+    `came` (n,), while forces change these by -`pressed` (n,) [m/s], at gaps (n,) [m]: those with which bodies that
+    meet at the surface, and leave it with e times the speed, come back to this gap. At e = 1 that is -came."""
+    half = 0.5 * np.maximum(pressed, 0.0)
+    fallen = 4.0 / dt * half * np.maximum(gap, 0.0)
+    parts: Floats = np.sqrt(np.maximum(e**2 * ((half - came) ** 2 + fallen) - fallen, 0.0)) - half
+    return parts
 
 
 def _map_of(world: World, contacts: Contacts, frame: Floats, drives: Drives) -> ContactMap:
