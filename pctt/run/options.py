@@ -83,13 +83,13 @@ def _read_scene(name: str, scene_class: type[Experiment], database: Mapping[str,
     """The scene with the options of the database. OptionError if it refuses one, or has bad numbers of its own."""
     try:
         scene = read(scene_class, database, "scene_")
+        _refuse_bad_numerics(name, scene)
     except OptionError:
         raise
     except ValueError as error:
         if not str(error).startswith(tuple(field.name for field in dataclasses.fields(scene_class))):
             raise
         raise OptionError(f"-scene_{error}") from None
-    _refuse_bad_numerics(name, scene)
     return scene
 
 

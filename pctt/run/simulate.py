@@ -91,6 +91,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         progress.doing(sim.steps, sim.time, end)
 
     progress.doing(sim.steps, sim.time, end)
+    interrupt.note_signals(sim.comm)
     sim.run(steps=steps, call=say, stop=lambda sim: interrupt.is_requested(sim.comm))
     if sim.steps < end:
         words = _how_to_go_on(options, output.checkpoint, end - sim.steps, settings.dt)
