@@ -23,6 +23,7 @@ from scipy.sparse.linalg import LinearOperator, splu
 from dem.contact_map import BlockRows, CompactRows, ContactMap
 from dem.exchange import on_any, on_each, reduced, refuse
 from pctt.arrays import Array, all_from
+from pctt.blocks import unready
 from pctt.ccp.cones import Cones
 from pctt.ccp.delassus import BlockMap, ColumnMap, GivenMatrix, GivenOperator, rows_of
 
@@ -432,6 +433,8 @@ def _masses(comm: MPI.Comm, masses: Any, n: int) -> Array | tuple[Solve, bool]:
     together. ValueError on all ranks for others."""
     if masses is None:
         return np.ones(n)
+    if isinstance(masses, (PETSc.Vec, PETSc.Mat, PETSc.KSP)):
+        _refuse_unready(comm, "masses", masses)
     if isinstance(masses, PETSc.Vec):
         masses = _whole_vector(masses)
     elif isinstance(masses, PETSc.Mat):
@@ -575,8 +578,15 @@ def _check_shape(comm: MPI.Comm, name: str, shape: tuple[int, int], rows: int, c
     refuse(comm, f"{name} has the shape {shape}; allowed is {allowed}, rows of this rank's contacts" if wrong else "")
 
 
+def _refuse_unready(comm: MPI.Comm, name: str, thing: PETSc.Object) -> None:
+    """ValueError on all ranks if a Mat, Vec or KSP lacks something on any."""
+    lack = unready(thing)
+    refuse(comm, lack and f"{name} is a {type(thing).__name__} that {lack}; allowed is one that is ready for use")
+
+
 def _check_mat(comm: MPI.Comm, name: str, mat: PETSc.Mat, rows: int, columns: int | None) -> None:
-    """ValueError on all ranks if a Mat has other ranks or other rows than the contacts."""
+    """ValueError on all ranks if a Mat is not ready, or has other ranks or other rows than the contacts."""
+    _refuse_unready(comm, name, mat)
     same = MPI.Comm.Compare(comm, mat.comm.tompi4py()) in (MPI.IDENT, MPI.CONGRUENT)
     refuse(comm, "" if same else f"{name} is a Mat on other ranks than the problem; allowed are the same")
     size = mat.getLocalSize()
