@@ -16,6 +16,9 @@ from functools import cache, lru_cache
 from typing import Any, TypeVar
 
 from dem.checks import MOST, nearest
+from dem.checks import function_or_none as function_or_none
+from dem.checks import known_arguments as known_arguments
+from dem.checks import short as short
 from dem.options import option as option
 
 Group = TypeVar("Group")
@@ -83,8 +86,8 @@ def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "
             try:
                 values[f.name] = _truth(text) if kind is bool else kind(text)
             except ValueError:
-                raise OptionError(f"-{name} {text}: allowed is {_allowed(kind, f.metadata)}") from None
-            _refuse(f"-{name} {text}", values[f.name], kind, f.metadata)
+                raise OptionError(f"{f'-{name} {text}'.rstrip()}: allowed is {_allowed(kind, f.metadata)}") from None
+            _refuse(f"-{name} {text}".rstrip(), values[f.name], kind, f.metadata)
     return group(**values)
 
 

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import structural_rank
 from scipy.sparse.linalg import LinearOperator, splu
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
-from dem.exchange import on_any, on_each, reduced, refuse
+from dem.exchange import greatest, on_any, on_each, reduced, refuse
 from pctt.arrays import Array, all_from
 from pctt.blocks import unready
 from pctt.ccp.cones import Cones
@@ -36,6 +36,8 @@ WITH_ENTRIES = ("aij", "baij", "sbaij", "dense", "nest", "sell", "is")
 #: what is the same on all ranks, and the kinds of it
 COLLECTIVE = ("N", "G", "masses", "point", "key")
 KINDS = ("not given", "an object of PETSc", "a map of bodies", "a function or a factor", "a matrix", "a vector")
+LARGEST = 1e140  #: of what is squared and multiplied with each other, and summed: a fourth power would overflow
+
 MATRICES = "a two-dimensional array, a scipy sparse matrix, a PETSc Mat"
 
 Solve = Callable[[Array], Array]
@@ -148,6 +150,18 @@ def wrong_velocities(r: Any, shape: tuple[int, ...]) -> str:
     if np.shape(r) != shape:
         return f"r has the shape {np.shape(r)}; allowed is {shape}"
     return _wrong_contacts(r, np.zeros(shape[0]))
+
+
+def refuse_out_of_range(comm: MPI.Comm, r: Array, diagonal: float) -> None:
+    """ValueError on all ranks for velocities r of a problem with this mean of the diagonal of N if squares of them or
+    of the impulses overflow, or vanish: all residuals would be zero or no numbers."""
+    most = greatest(comm, float(np.abs(r).max(initial=0.0)))
+    if most and not all(1.0 / LARGEST <= size <= LARGEST for size in (most, diagonal, most / diagonal)):
+        raise ValueError(
+            f"r of up to {most:.1e} and N of {diagonal:.1e} (the mean of its diagonal): squares of velocities or "
+            f"impulses leave the range of double precision; allowed are r, N and r / N from {1.0 / LARGEST:g} to "
+            f"{LARGEST:g}, as other units may make them"
+        )
 
 
 def padded(rows: Array) -> Array:

@@ -161,13 +161,15 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, compare: ccp.Compa
     comm = compare.comm
     given = {n: spelt for n, spelt in solver_options(database).items() if n.startswith(("ksp_", "pc_"))}
     for name, (allowed, holds) in TOLERANCES.items():
-        spelt = given.get(name, "")
+        if name not in given:
+            continue
+        spelt = given[name]
         try:
-            value = float(database.get(spelt) or 0.0)
+            value = float(database[spelt] or "nan")
         except ValueError:
             continue  # PETSc says what is no number
         if not holds(value):
-            raise OptionError(f"-{spelt} {database[spelt]}: allowed is {allowed}")
+            raise OptionError(f"{f'-{spelt} {database[spelt] or str()}'.rstrip()}: allowed is {allowed}")
     ksps = []
     later = INCOMPLETE if form == "contact" and "pc_type" not in given else {}
     try:
