@@ -31,10 +31,9 @@ def doubts(scene: Scene) -> str:
 
 def _density(scene: Scene) -> str:
     """Of densities that would be in g/cm^3, or that nothing has."""
-    given = [part.given["density"].sample() for part in scene.parts]
-    given += [body.density for body in scene.large_bodies if body.density is not None]
-    given += [source.density for source in scene.passages.sources.values()]
-    every = np.concatenate([np.ravel(density) for density in given] or [[]])
+    large = [body.density for body in scene.large_bodies if body.density is not None]
+    sources = [source.density for source in scene.passages.sources.values()]
+    every = np.hstack([np.zeros(0), *(part.given["density"].sample() for part in scene.parts), *large, *sources])
     least, most = every.min(initial=math.inf), every.max(initial=0.0)
     light = f"a density of {least:.3g} kg/m^3: is it in g/cm^3, which are 1000 kg/m^3?" if least < LIGHT else ""
     heavy = f"a density of {most:.3g} kg/m^3: no solid has more than 22600" if most > HEAVY else ""

@@ -174,6 +174,8 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison, newton: cc
         used = result.solver or settings.solver
         by_newton = ccp.SOLVERS[used].newton
         systems = "; ".join(filter(None, (newton.linear.words(), newton.linear.what()))) if by_newton else ""
+    except ValueError as error:
+        raise OptionError(f"-problem {options.run.problem}: {error}") from None
     finally:
         newton.destroy()
     seconds = log.take_seconds(("solve", "compare"))
