@@ -28,10 +28,11 @@ class OptionError(ValueError):
     """A bad option. The message names the option, its value and the allowed values."""
 
 
-def number(default: Any, why: str) -> Any:
+def number(default: Any, why: str, check: Any = None) -> Any:
     """Return a dataclass field that steers a method and is set from Python only; ``why`` is its derivation or
-    measurement."""
-    return dataclasses.field(default=default, metadata={"help": why, "python_only": True})
+    measurement, ``check`` what `refuse_bad` allows, in words, and a test of a value."""
+    checked = {} if check is None else {"check": check}
+    return dataclasses.field(default=default, metadata={"help": why, "python_only": True, **checked})
 
 
 def _named(group: type, prefix: str) -> dict[str, dataclasses.Field]:

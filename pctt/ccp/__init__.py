@@ -61,6 +61,7 @@ __all__ = [
     "with_part",
 ]
 
+GRIPS = 10.0  #: more friction than anything has, and so with any tolerance
 STEEP = 0.1  #: mu tol; with 0.05 a sphere rolls as it should, with 0.5 it may roll backwards
 
 
@@ -124,10 +125,10 @@ def solve(
 def why_steep(mu: float, tol: float) -> str:
     """Why friction of this coefficient cannot be solved for with a tolerance; empty if it can. De Saxce's term is mu
     times as large as slip, so that a residual of `tol` lets contacts close at mu tol times the speed of all."""
-    if mu * tol <= STEEP:
+    if mu <= max(STEEP / tol, GRIPS):
         return ""
     says = f"a residual of tol lets contacts close at {mu * tol:.1g} times the speeds of the problem"
-    return f"{mu:g} with tol {tol:g}: {says}; allowed is up to {STEEP / tol:.3g}, which holds as well"
+    return f"{mu:g} with tol {tol:g}: {says}; allowed is up to {max(STEEP / tol, GRIPS):.3g}, which holds as well"
 
 
 def watched(comm: MPI.Comm, limits: Limits, monitor: Callable[[int, float], None] | None = None) -> Limits:

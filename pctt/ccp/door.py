@@ -31,6 +31,7 @@ FULL = 10_000  # rows up to which N is found by a product with each unit vector,
 MOST = 50_000_000  # numbers of an N that is made by solves; of a larger one the diagonal blocks are kept
 BATCH = 300  # rows of N that are made together
 ALIKE = 1e-6  # of the largest entry of a matrix: by how much an entry may differ from its mirror image
+ABOUT = 1e-2  # of a block: by how much a product may differ from it
 #: types of Mats that have entries; others are known by their products
 WITH_ENTRIES = ("aij", "baij", "sbaij", "dense", "nest", "sell", "is")
 #: what is the same on all ranks, and the kinds of it
@@ -90,8 +91,10 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: An
     contact of the plane has the friction 0 along its second tangent, in which nothing moves."""
     kinds = [kind_of(data.get(name)) for name in COLLECTIVE]
     N = data.pop("N", None)
-    parts = 1 if cones is None else cones.parts
-    if (mu is None) == (cones is None):
+    parts = cones.parts if isinstance(cones, Cones) else 1
+    if cones is not None and not isinstance(cones, Cones):
+        words = f"cones are of the type {type(cones).__name__}; allowed are FrictionCones and RollingCones of pctt.ccp"
+    elif (mu is None) == (cones is None):
         words = "a cone problem has either mu or cones"
     elif cones is not None:
         words = cones.why_refused() or _wrong_contacts(r, mu := cones.mu, parts=parts, **data)
@@ -331,7 +334,7 @@ def _by_products(comm: MPI.Comm, nc: int, width: int, N: Any) -> GivenOperator: 
     mult = _product(comm, N.mult, nc, width)
 
     def product(g: Array) -> Array:
-        return padded(on_each(comm, "N.mult", lambda: rows(np.ascontiguousarray(g[:, :width]))))
+        return padded(on_each(comm, "N.mult", lambda: rows(np.array(g[:, :width]))))  # which it may change
 
     def rows(g: Array) -> Array:
         y = np.asarray(mult(g), dtype=float)
@@ -347,6 +350,11 @@ def _by_products(comm: MPI.Comm, nc: int, width: int, N: Any) -> GivenOperator: 
     Nx, Nz = given.velocities(x), given.velocities(z)
     numbers = np.isfinite(Nx).all() and np.isfinite(Nz).all()
     refuse(comm, "" if numbers else "N.mult returns a NaN or an infinite number")
+    unit = np.zeros((nc, 3))
+    unit[:1, 0] = float(comm.rank == 0)
+    first = given.velocities(unit)[:1, :width] - unit[:1, :1] * blocks[:1, :, 0]
+    unlike = comm.rank == 0 and np.abs(first).max(initial=0.0) > ABOUT * np.abs(blocks[:1]).max(initial=0.0)
+    refuse(comm, "N.mult of the first contact's normal is not the first column of N.blocks[0]" if unlike else "")
     sums = comm.allreduce(np.array([np.vdot(z, Nx), np.vdot(x, Nz), np.vdot(x, x), np.vdot(Nz, Nz)]))
     if abs(sums[0] - sums[1]) > ALIKE * np.sqrt(sums[2] * sums[3]):
         raise ValueError(f"N.mult is not symmetric: x'Nz = {sums[1]:.6g} and z'Nx = {sums[0]:.6g}")

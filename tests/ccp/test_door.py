@@ -484,6 +484,9 @@ def test_calls_with_what_they_cannot_take():
         r"the solver \['apgd'\]: allowed are": lambda: ccp.solve(problem, type=["apgd"]),
         "the solver 'none': allowed are": lambda: ccp.newton_for(SELF, "none"),
         "monitor 3: allowed is a function": lambda: ccp.solve(problem, monitor=3),
+        "aim -1: allowed is a number above 0": lambda: ccp.solve(problem, limits={"aim": -1}),
+        "cones are of the type list": lambda: ccp.ConeProblem(SELF, case.r, cones=[0.5], N=case.N),
+        r"not the first column of N.blocks\[0\]": lambda: case.problem(N=ccp.Operator(case.mult, 2.0 * case.blocks)),
         "comm .*: allowed is a communicator of mpi4py": lambda: ccp.ConeProblem(case.r, case.mu, N=case.N),
     }.items():
         with pytest.raises(ValueError, match=words):
@@ -495,3 +498,14 @@ def test_calls_with_what_they_cannot_take():
     }.items():
         with pytest.raises(TypeError, match=words):
             call()
+
+
+def test_an_operator_may_change_its_argument():
+    case = Case()
+
+    def in_place(g):
+        g[:] = case.mult(g)
+        return g
+
+    one, other = (ccp.solve(case.problem(N=ccp.Operator(mult, case.blocks))) for mult in (case.mult, in_place))
+    assert np.array_equal(one.impulse, other.impulse)
