@@ -44,6 +44,7 @@ def _named(group: type, prefix: str) -> dict[str, dataclasses.Field]:
 POSITIVE = ("a positive number", lambda x: math.isfinite(x) and x > 0)
 NOT_NEGATIVE = ("a number >= 0", lambda x: math.isfinite(x) and x >= 0)
 FRACTION = ("a number between 0 and 1, both excluded", lambda x: 0 < x < 1)
+PART = ("a number above 0, up to 1", lambda x: 0 < x <= 1)
 AT_LEAST_ONE = ("a whole number >= 1", lambda x: x >= 1)
 COUNT = ("a whole number >= 0", lambda x: x >= 0)
 

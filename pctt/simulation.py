@@ -127,6 +127,8 @@ class Simulation:
         """
         if not isinstance(scene, (Scene, Experiment)):
             raise OptionError(f"scene {scene!r}: allowed is a dem.scene.Scene or an instance of an Experiment")
+        if not isinstance(comm, MPI.Comm):
+            raise OptionError(f"comm {comm!r}: allowed is a communicator of mpi4py, such as MPI.COMM_WORLD")
         self.comm = comm
         self.experiment = scene if isinstance(scene, Experiment) else SceneExperiment(scene)
         given = {**(vars(settings) if settings else {}), **changes}
@@ -549,7 +551,8 @@ class Simulation:
         given = folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems
         folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems = self.comm.bcast(given)
         _name("write", folder, "folder")
-        run = Run(output_every=every, checkpoint_every=checkpoint_every, checkpoint_minutes=checkpoint_minutes)
+        steps = {"output_every": every, "checkpoint_every": checkpoint_every, "checkpoint_minutes": checkpoint_minutes}
+        run = Run(**steps, overwrite=overwrite)
         try:
             refuse_bad(run)
         except OptionError as error:  # as the argument is called here

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pctt.arrays import Array
-from pctt.options import COUNT, FRACTION, number, option
+from pctt.options import COUNT, FRACTION, PART, number, option
 
 if TYPE_CHECKING:
     from pctt.ccp.problem import Errors
@@ -49,7 +49,7 @@ class Limits:
     )  # fmt: skip
     aim: float = number(
         1.0, "where that pays, a method goes on to this part of the limits, for as many iterations as are spare",
-        check=("a number above 0, up to 1", lambda x: 0 < x <= 1),
+        check=PART,
     )  # fmt: skip
     spare: int = number(0, "the iterations for it; the conic method, which takes a few, needs none", check=COUNT)
     fallback: bool = option(True, "where the solver does not converge, another one goes on from its impulses")

@@ -206,6 +206,13 @@ def test_calls_with_what_they_cannot_take(tmp_path):
         "restart 3: allowed is the name of a checkpoint": lambda: Simulation(scene, restart=3),
         r"scale of .*a.obj: allowed is one number, got \(1, 2\)": lambda: Mesh.read(tmp_path / "a.obj", scale=(1, 2)),
         "file of a mesh 3: allowed is the name of a file": lambda: Mesh.read(3),
+        "n 1.5: allowed is a whole number": lambda: Mixer(n=1.5),
+        "radius '0.1': allowed is a number": lambda: Mixer(radius="0.1"),
+        "comm 3: allowed is a communicator of mpi4py": lambda: Simulation(scene, comm=3),
+        "period must have three entries, for x, y and z, got 1.0": lambda: Scene(0.5, period=1.0),
+        "friction None: allowed is a number >= 0": lambda: Scene(None),
+        "overwrite 'no': allowed is true or false": lambda: sim.write(tmp_path / "run", overwrite="no"),
+        "decay 0: allowed is a number above 0, up to 1": lambda: Simulation(scene, solver="apgd", options={"decay": 0}),
     }.items():
         with pytest.raises(ValueError, match=words):
             call()
