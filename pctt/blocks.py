@@ -67,8 +67,10 @@ def diagonal_matrix(diagonal: PETSc.Vec) -> PETSc.Mat:
 # -- objects of the user -------------------------------------------------------------------------------------
 
 
-def unready(thing: PETSc.Object) -> str:
+def unready(thing: Any) -> str:
     """What a Mat, Vec or KSP lacks, in words; "" if nothing. PETSc may crash where one was never created."""
+    if not isinstance(thing, PETSc.Object):
+        return f"is a {type(thing).__name__}"
     if not thing.handle:
         return "was never created, or is destroyed"
     if isinstance(thing, PETSc.KSP):
@@ -81,7 +83,7 @@ def unready(thing: PETSc.Object) -> str:
 def refuse_unready(who: str, *mats: PETSc.Mat) -> None:
     """ValueError that says who refuses a Mat which is not ready for use."""
     if wrong := next(filter(None, map(unready, mats)), ""):
-        raise ValueError(f"{who}: the Mat {wrong}; allowed is an assembled one")
+        raise ValueError(f"{who}: the Mat {wrong}; allowed is an assembled Mat")
 
 
 # -- diagonal blocks -----------------------------------------------------------------------------------------

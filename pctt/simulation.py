@@ -551,8 +551,10 @@ class Simulation:
         given = folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems
         folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems = self.comm.bcast(given)
         _name("write", folder, "folder")
-        steps = {"output_every": every, "checkpoint_every": checkpoint_every, "checkpoint_minutes": checkpoint_minutes}
-        run = Run(**steps, overwrite=overwrite)
+        run = Run(
+            output_every=every, checkpoint_every=checkpoint_every, checkpoint_minutes=checkpoint_minutes,
+            overwrite=overwrite,
+        )  # fmt: skip
         try:
             refuse_bad(run)
         except OptionError as error:  # as the argument is called here

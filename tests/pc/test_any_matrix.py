@@ -86,6 +86,8 @@ def test_a_matrix_that_is_not_ready_is_refused_by_all_that_take_one(kind):
         for given in ({"N": mat}, {"G": mat, "masses": np.ones(6)}, {"G": np.eye(6), "masses": mat}):
             with refused(f"is a Mat that .*{words}"):
                 ConeProblem(MPI.COMM_SELF, r, mu, **given)
+    with refused("pctt.mat.inverse: the Mat is a str; allowed is an assembled Mat"):
+        inverse("mat")
     for masses in (PETSc.Vec(), PETSc.Vec().create(), PETSc.KSP(), PETSc.KSP().create()):
         with refused(f"masses is a {type(masses).__name__} that "):
             ConeProblem(MPI.COMM_SELF, r, mu, G=np.eye(6), masses=masses)
@@ -118,6 +120,16 @@ def test_bad_coordinates_are_refused_at_set_up(points, words):
     ksp = solver(mat)
     with refused(f"{words}.*allowed are finite numbers of shape"):
         ksp.setUp()
+
+
+@pytest.mark.parametrize("scale", [1e-290, 1.0, 1e290])
+def test_symmetry_does_not_depend_on_units(scale):
+    mat = filled("dense")
+    mat.scale(scale)
+    assert is_symmetric(mat)
+    mat.setValue(0, 1, 10.0 * abs(mat.getValue(0, 0)))
+    mat.assemble()
+    assert not is_symmetric(mat)
 
 
 def test_a_matrix_that_is_not_symmetric_is_said_to_be_so():
