@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable
-from typing import Any
+from dataclasses import fields
+from functools import wraps
+from inspect import Parameter, signature
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from dem.arrays import ArrayLike, Floats, Ints
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 MOST = 1e150  #: squares of greater numbers overflow
 
@@ -20,6 +25,35 @@ def nearest(name: str, known: Iterable[str], dash: str = "", alike: float = 0.61
     begins = sorted(begun, key=len, reverse=True)
     close = begins or difflib.get_close_matches(name, sorted(known), n=1, cutoff=alike)
     return f"; did you mean {dash}{close[0]}?" if close else ""
+
+
+def known_arguments(**groups: type) -> Callable[[Function], Function]:
+    """A function that says by which names it takes arguments: TypeError for another one, which the fields of the
+    dataclasses `groups` may have, the arguments of these names."""
+    homes = {field.name: group for group, kind in groups.items() for field in fields(kind)}
+
+    def decorated(function: Function) -> Function:
+        kinds = {name: each.kind for name, each in signature(function).parameters.items() if name != "self"}
+
+        @wraps(function)
+        def checked(*given: Any, **named: Any) -> Any:
+            for name in set() if Parameter.VAR_KEYWORD in kinds.values() else named.keys() - kinds:
+                meant = f"; {homes[name]} has it: {homes[name]}={{{name!r}: ...}}" if name in homes else ""
+                names = (name for name, kind in kinds.items() if kind is not Parameter.VAR_POSITIONAL)
+                allowed = f"allowed are {', '.join(names)}{meant or nearest(name, kinds)}"
+                what = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
+                raise TypeError(f"{what}: there is no argument {name!r}; {allowed}")
+            return function(*given, **named)
+
+        return cast(Function, checked)
+
+    return decorated
+
+
+def function_or_none(name: str, given: Any) -> None:
+    """Raise ValueError unless this is a function, or None."""
+    if given is not None and not callable(given):
+        raise ValueError(f"{name} {short(given)}: allowed is a function")
 
 
 def new_name(what: str, name: Any, taken: Iterable[str]) -> None:

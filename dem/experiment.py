@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import numbers
 import sys
 import traceback
 import typing
@@ -26,6 +27,12 @@ if TYPE_CHECKING:
     from dem.step import Step
 
 __all__ = ["Experiment", "SceneExperiment", "SceneFileError", "from_file", "option"]
+
+#: What a value of an option may be, by the name of the type that its field has.
+KINDS: dict[Any, tuple[str, type]] = {
+    "int": ("a whole number", numbers.Integral), "float": ("a number", numbers.Real), "bool": ("True or False", bool),
+    "str": ("a text", str),
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,10 +56,13 @@ class Experiment:
     digest: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
-        """ValueError for numbers that fail the check of their option, or are not finite where it has none. The message
-        starts with the name of the option. Extend this to check more."""
+        """ValueError for values of another type than that of their option, and for numbers that fail its check, or are
+        not finite where it has none. The message starts with the name of the option. Extend this to check more."""
         for field in dataclasses.fields(self):
             value, check = getattr(self, field.name), field.metadata.get("check")
+            allowed, kind = KINDS.get(getattr(field.type, "__name__", field.type), ("", object))
+            if value is not field.default and not isinstance(value, kind):
+                raise ValueError(f"{field.name} {value!r}: allowed is {allowed}")
             if isinstance(check, tuple) and not check[1](value):
                 raise ValueError(f"{field.name} {value}: allowed is {check[0]}")
             if callable(check):

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from dem.arrays import ArrayLike, Bools, Floats, Ints
-from dem.checks import between, check_fields, finite, not_negative, positive, rows, unit_quaternion, vector
+from dem.checks import between, check_fields, finite, not_negative, number, positive, rows, unit_quaternion, vector
 from dem.compiled import loop
 from dem.geometry import obj, stl
 from dem.quaternion import cross, length
@@ -356,7 +356,9 @@ class Mesh:
 
         ValueError, which names the file, if it cannot be read, has no triangle or needs trimesh, which is not there.
         """
-        positive(f"scale of {file}", scale)
+        if not isinstance(file, (str, Path)):
+            raise ValueError(f"file of a mesh {file!r}: allowed is the name of a file")
+        positive(f"scale of {file}", number(f"scale of {file}", scale))
         if not Path(file).is_file():
             raise ValueError(f"{file}: no such file")
         try:

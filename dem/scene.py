@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial, wraps
-from inspect import Parameter, signature
+from inspect import signature
 from typing import Any, TypeVar, Union, cast
 
 import numpy as np
@@ -169,15 +169,12 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 def _building(method: Method) -> Method:
     """A method that adds to a scene, or changes it: ValueError once a simulation has the scene, TypeError for an
     argument that it does not have."""
-    known = {name: each.kind for name, each in list(signature(method).parameters.items())[1:]}
+    named_well = checks.known_arguments()(method)
 
     @wraps(method)
     def checked(scene: Scene, *given: Any, **named: Any) -> Any:
         scene.refuse_finished(method.__name__)
-        for name in set() if Parameter.VAR_KEYWORD in known.values() else named.keys() - known:
-            there = f"allowed are {', '.join(known)}{checks.nearest(name, known)}"
-            raise TypeError(f"{method.__name__}: there is no argument {name!r}; {there}")
-        return method(scene, *given, **named)
+        return named_well(scene, *given, **named)
 
     return cast(Method, checked)
 

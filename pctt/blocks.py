@@ -64,6 +64,28 @@ def diagonal_matrix(diagonal: PETSc.Vec) -> PETSc.Mat:
     return new_matrix(diagonal.comm.tompi4py(), (sizes, sizes), 1, csr, PETSc.Mat.Type.AIJ)
 
 
+# -- objects of the user -------------------------------------------------------------------------------------
+
+
+def unready(thing: Any) -> str:
+    """What a Mat, Vec or KSP lacks, in words; "" if nothing. PETSc may crash where one was never created."""
+    if not isinstance(thing, PETSc.Object):
+        return f"is a {type(thing).__name__}"
+    if not thing.handle:
+        return "was never created, or is destroyed"
+    if isinstance(thing, PETSc.KSP):
+        return "".join(f"has an operator that {lack}" for lack in map(unready, thing.getOperators()[:1]) if lack)
+    if not thing.type or np.min(thing.getLocalSize()) < 0:
+        return "has no type or no sizes"
+    return "is not assembled" if isinstance(thing, PETSc.Mat) and not thing.isAssembled() else ""
+
+
+def refuse_unready(who: str, *mats: PETSc.Mat) -> None:
+    """ValueError that says who refuses a Mat which is not ready for use."""
+    if wrong := next(filter(None, map(unready, mats)), ""):
+        raise ValueError(f"{who}: the Mat {wrong}; allowed is an assembled Mat")
+
+
 # -- diagonal blocks -----------------------------------------------------------------------------------------
 
 
@@ -126,6 +148,7 @@ def put_diagonal_blocks(mat: PETSc.Mat, blocks: Array) -> None:
 def block_diagonal(P: PETSc.Mat, blocks: Array | None = None) -> PETSc.Mat:
     """A new Mat with the diagonal blocks of P, or these ``blocks``; ``pbjacobi`` needs nothing else. For an assembled P
     it is a copy. The caller destroys the Mat."""
+    refuse_unready("pctt.blocks.block_diagonal", P)
     shell = shell_of(P)
     blocks = shell.blocks if blocks is None and shell else blocks
     if blocks is None:

@@ -16,6 +16,9 @@ from functools import cache, lru_cache
 from typing import Any, TypeVar
 
 from dem.checks import MOST, nearest
+from dem.checks import function_or_none as function_or_none
+from dem.checks import known_arguments as known_arguments
+from dem.checks import short as short
 from dem.options import option as option
 
 Group = TypeVar("Group")
@@ -25,10 +28,11 @@ class OptionError(ValueError):
     """A bad option. The message names the option, its value and the allowed values."""
 
 
-def number(default: Any, why: str) -> Any:
+def number(default: Any, why: str, check: Any = None) -> Any:
     """Return a dataclass field that steers a method and is set from Python only; ``why`` is its derivation or
-    measurement."""
-    return dataclasses.field(default=default, metadata={"help": why, "python_only": True})
+    measurement, ``check`` what `refuse_bad` allows, in words, and a test of a value."""
+    checked = {} if check is None else {"check": check}
+    return dataclasses.field(default=default, metadata={"help": why, "python_only": True, **checked})
 
 
 def _named(group: type, prefix: str) -> dict[str, dataclasses.Field]:
@@ -40,6 +44,7 @@ def _named(group: type, prefix: str) -> dict[str, dataclasses.Field]:
 POSITIVE = ("a positive number", lambda x: math.isfinite(x) and x > 0)
 NOT_NEGATIVE = ("a number >= 0", lambda x: math.isfinite(x) and x >= 0)
 FRACTION = ("a number between 0 and 1, both excluded", lambda x: 0 < x < 1)
+PART = ("a number above 0, up to 1", lambda x: 0 < x <= 1)
 AT_LEAST_ONE = ("a whole number >= 1", lambda x: x >= 1)
 COUNT = ("a whole number >= 0", lambda x: x >= 0)
 
@@ -83,8 +88,8 @@ def read(group: type[Group], database: Mapping[str, str | None], prefix: str = "
             try:
                 values[f.name] = _truth(text) if kind is bool else kind(text)
             except ValueError:
-                raise OptionError(f"-{name} {text}: allowed is {_allowed(kind, f.metadata)}") from None
-            _refuse(f"-{name} {text}", values[f.name], kind, f.metadata)
+                raise OptionError(f"{f'-{name} {text}'.rstrip()}: allowed is {_allowed(kind, f.metadata)}") from None
+            _refuse(f"-{name} {text}".rstrip(), values[f.name], kind, f.metadata)
     return group(**values)
 
 

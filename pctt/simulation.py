@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -28,6 +28,7 @@ from dem import measures
 from dem import record as recording
 from dem.arrays import Floats, frozen
 from dem.bodies import Bodies
+from dem.checks import function_or_none, known_arguments, number
 from dem.exchange import on_any
 from dem.experiment import Experiment, SceneExperiment
 from dem.measures import Sample
@@ -41,7 +42,7 @@ from dem.record.energies import energy
 from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.start import step_remark
 from dem.start.doubts import RoomWatch, doubts
-from dem.start.time_step import fall_remark, reason, smallest
+from dem.start.time_step import distance_remark, fall_remark, reason, smallest
 from dem.start.tools import PaceWatch, SwingWatch, half_turn_remark
 from dem.start.turns import TurnWatch
 from dem.step import Step
@@ -75,6 +76,13 @@ def _collective(method: Method) -> Method:
         return method(sim, *given, **named)
 
     return cast(Method, met)
+
+
+def _name(call: str, given: Any, what: str = "file") -> str | Path:
+    """What is given as the name of a file or folder; OptionError if it is none."""
+    if not isinstance(given, (str, Path)) or not str(given):
+        raise OptionError(f"{call}({given!r}): allowed is the name of a {what}")
+    return given
 
 
 class Simulation:
@@ -118,6 +126,8 @@ class Simulation:
         """
         if not isinstance(scene, (Scene, Experiment)):
             raise OptionError(f"scene {scene!r}: allowed is a dem.scene.Scene or an instance of an Experiment")
+        if not isinstance(comm, MPI.Comm):
+            raise OptionError(f"comm {comm!r}: allowed is a communicator of mpi4py, such as MPI.COMM_WORLD")
         self.comm = comm
         self.experiment = scene if isinstance(scene, Experiment) else SceneExperiment(scene)
         given = {**(vars(settings) if settings else {}), **changes}
@@ -128,6 +138,8 @@ class Simulation:
         )
         refuse_unlike(self.settings, comm)
         restart = restart if isinstance(restart, state.RunState) else comm.bcast(restart)
+        if not isinstance(restart, (str, Path, state.RunState)):
+            raise OptionError(f"restart {restart!r}: allowed is the name of a checkpoint, or 'settled'")
         scene = state.built(self.experiment, comm)
         self.dt_reason = reason(scene) if self.settings.dt is None else ""
         self.settings = self.settings.fitted(scene, compared)
@@ -150,6 +162,8 @@ class Simulation:
             warn(comm, large)
         if likely := "" if restart else comm.bcast(doubts(scene)):
             warn(comm, likely)
+        if distant := comm.bcast(distance_remark(scene, self.settings.delta)):
+            warn(comm, distant)
         half = smallest(scene)
         self._watches = TurnWatch(), SwingWatch(), PaceWatch(half, scene.leaving), LooseWatch(half), RoomWatch()
         self._tell_turns()
@@ -181,7 +195,7 @@ class Simulation:
     def load(cls, path: str | Path, scene: Scene | Experiment, *given: Any, **more: Any) -> Simulation:
         """The simulation that `save` kept, or a checkpoint.h5 of a run, with the same scene and time step; the other
         arguments are those of a new one. On as many ranks it goes on with the same bits."""
-        return cls(scene, *given, restart=path, **more)
+        return cls(scene, *given, restart=_name("load", path), **more)
 
     def copy(self) -> Simulation:
         """Another simulation in the same state, which goes on with the same bits, and writes no files; collective."""
@@ -277,6 +291,7 @@ class Simulation:
                 warn(self.comm, words)
 
     @_collective
+    @known_arguments()
     def run(
         self,
         *bare: float,
@@ -293,6 +308,8 @@ class Simulation:
         if bare:
             says = ", ".join(map(repr, bare))
             raise OptionError(f"run({says}): steps or seconds? allowed is run(steps={says}), or run(until={says}) [s]")
+        for name, given in {"call": call, "stop": stop}.items():
+            together(self.comm, "run", partial(function_or_none, f"run({name}=...)", given), own=(ValueError,))
         until, steps, every, endless = self.comm.bcast((until, steps, every, until is steps is stop is None))
         if endless:
             raise OptionError("run: without an end; allowed are until, steps and stop")
@@ -301,7 +318,7 @@ class Simulation:
             raise OptionError(f"run(every={every}): allowed are whole numbers from 1 on")
         left = math.inf if steps is None else steps
         if until is not None:
-            left = min(left, self._steps_until(float(until)))
+            left = min(left, self._steps_until(number("run(until=...)", until)))
         first, end, ends = self.steps, self.steps + left, False
         called, watched = on_any(self.comm, call is not None, call is not None or stop is not None)
         if every != 1 and not called:
@@ -458,7 +475,14 @@ class Simulation:
         it cannot have (`dem.model.changes.change`)."""
         together(self.comm, what, partial(refuse_functions, what, values), own=(ValueError,))
         values = self.comm.bcast(values)
+        self._refuse_steep({name: values[name] for name in ("friction", "static_friction") if name in values})
         together(self.comm, what, partial(change, self.world, what, **values), own=(ValueError, TypeError))
+
+    def _refuse_steep(self, friction: Mapping[str, float]) -> None:
+        """ValueError for coefficients that the tolerance does not allow."""
+        for name, given in friction.items():
+            if self.settings.law == ccp.COULOMB and (steep := ccp.why_steep(number(name, given), self.settings.tol)):
+                raise ValueError(f"{name} {steep}")
 
     @property
     def period(self) -> Floats | None:
@@ -474,7 +498,7 @@ class Simulation:
 
     def spring_force(self, name: str) -> Floats:
         """Force (3,) of a spring on its second end, its mean over the last step [N]. ValueError before the first step,
-        KeyError if there is none of that name. Not collective."""
+        or if there is none of that name. Not collective."""
         return self._last.spring_force(name)
 
     def joint(self, name: str) -> JointNow:
@@ -494,6 +518,7 @@ class Simulation:
     @uninterrupted()
     def save(self, path: str | Path) -> None:
         """Keep the state in a checkpoint, from which `load` goes on. FileError if that fails."""
+        path = _name("save", self.comm.bcast(path))
         refuse_unwritable("save", Path(path).parent, self.comm)
         self._save(Path(path))
 
@@ -524,9 +549,11 @@ class Simulation:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
         given = folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems
         folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems = self.comm.bcast(given)
-        if not isinstance(folder, (str, Path)) or not str(folder):
-            raise OptionError(f"write({folder!r}): allowed is the name of a folder")
-        run = Run(output_every=every, checkpoint_every=checkpoint_every, checkpoint_minutes=checkpoint_minutes)
+        _name("write", folder, "folder")
+        run = Run(
+            output_every=every, checkpoint_every=checkpoint_every, checkpoint_minutes=checkpoint_minutes,
+            overwrite=overwrite,
+        )  # fmt: skip
         try:
             refuse_bad(run)
         except OptionError as error:  # as the argument is called here

@@ -95,8 +95,7 @@ BELOW = {
     "dem.contact_map": {"dem.arrays", "dem.compiled", "dem.exchange"},
     "pctt.body_matrix": {"pctt.blocks", "dem.compiled", "dem.contact_map", "dem.exchange"},
     "pctt.mat": {
-        "pctt.disk", "dem.exchange", "dem.geometry.morton", "pctt.options", "pctt.petsc",
-        "pctt.tt",
+        "pctt.blocks", "pctt.disk", "dem.exchange", "dem.geometry.morton", "pctt.options", "pctt.petsc", "pctt.tt",
     },
     "pctt.folder": {"dem", "pctt.disk", "pctt.json_text"},
     "pctt.scenes": {"dem"},

@@ -103,7 +103,7 @@ def test_values_are_converted(name, text, expected):
     ],
 )
 def test_errors_name_option_value_and_what_is_allowed(name, text, allowed):
-    assert error(name, text).startswith(f"-x_{name} {text}: allowed is {allowed}")
+    assert error(name, text).startswith(f"{f'-x_{name} {text}'.rstrip()}: allowed is {allowed}")
 
 
 def test_a_misspelt_choice_gets_the_nearest():

@@ -33,10 +33,14 @@ def change(world: World, what: str, **values: Any) -> None:
     with coefficients of `dem.parts.contact_law.CHANGED`; or "cell" with `shear_rate`, `stress`, `strain_rate`. A part
     that is not there begins, if the class's `BEGINS` is among the values.
     """
+    if not isinstance(what, str):
+        raise ValueError(f"change {checks.short(what)}: allowed is a kind and a name, such as 'body belt'")
     kind, _, name = what.partition(" ")
     if kind not in CHANGED:
         allowed = f"allowed are {', '.join(CHANGED[:-1])} with a name, and cell"
         raise ValueError(f"{what!r}: {allowed}{nearest(kind, CHANGED)}")
+    if not values:
+        raise ValueError(f"{what}: no values; allowed are some by name, as in change('spring tie', length=0.5)")
     refuse_functions(what, values)
     if kind == "cell":
         _refuse_others(what, values, world.cell.CHANGED)

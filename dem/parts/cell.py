@@ -323,7 +323,7 @@ def of_scene(
 
 def _triple(name: str, values: Sequence[float | None], check: Callable[..., Floats], none: float) -> Floats:
     """Numbers (3,) that have passed a check, and `none` where None stands."""
-    if len(values) != 3:
+    if np.shape(np.asarray(values, object)) != (3,):
         raise ValueError(f"{name} must have three entries, for x, y and z, got {values}")
     return np.array([none if value is None else float(check(name, value)) for value in values])
 

@@ -118,6 +118,8 @@ def law(
             allowed = f"allowed are {', '.join(CHECKS)}{checks.nearest(name, (*CHECKS, *beside))}"
             raise ValueError(f"{name}: no such coefficient of contacts; {allowed}")
     given = {name: checks.number(name, value) for name, value in values.items() if value is not None}
+    if before is None and "friction" not in given:
+        raise ValueError("friction None: allowed is a number >= 0")
     return replace(before, **given) if before else ContactLaw(**given)
 
 

@@ -16,6 +16,7 @@ from mpi4py import MPI
 from dem import bodies
 from dem.arrays import ArrayLike, Bools, Floats, Ints
 from dem.bodies import COMPOUND, Bodies, radius_about
+from dem.checks import number
 from dem.compiled import loop
 from dem.exchange import broadcast, reduced
 from dem.experiment import Experiment
@@ -64,7 +65,7 @@ def _own(step: Step, scene: Experiment, taken: Mapping[str, float]) -> dict[str,
                 raise ValueError(f"record returns the name {name!r}: allowed is text without comma that is not in use")
             if np.ndim(value) != 0:
                 raise ValueError(f"record returns {name!r} = {value!r}: allowed is a number")
-        return {name: float(value) for name, value in own.items()}
+        return {name: number(f"record returns {name!r}", value) for name, value in own.items()}
 
     own = together(step.world.comm, what, record)
     names = digest(str(list(own))) >> 8  # 52 bits
@@ -82,7 +83,7 @@ def cell(step: Step) -> dict[str, float]:
 def outside(step: Step, low: ArrayLike, high: ArrayLike) -> float:
     """Return the number of grains whose centre has left the box from `low` (3,) to `high` (3,) [m]."""
     place = step.world.cell.wrapped(step.world.grains.position)
-    return step.total(count_outside(place, np.asarray(low, float), np.asarray(high, float)))
+    return step.total(count_outside(place, np.full(3, low, float), np.full(3, high, float)))
 
 
 @loop

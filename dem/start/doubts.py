@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from dem.model.world import World
 
 HUGE = 50.0  #: lengths of the bed; in millimetres a mesh as long as a twentieth of it is longer
+HEAVY = 1e5  #: five times osmium [kg/m^3]
 LIGHT = 10.0  #: less than foams have [kg/m^3]; solids have 0.5 to 22.6 g/cm^3
 STEPS = 100  #: without room for the first grain of a source
 
@@ -25,15 +26,18 @@ STEPS = 100  #: without room for the first grain of a source
 def doubts(scene: Scene) -> str:
     """What is likely a mistake, in words: of materials, laws, densities, sizes, of what bears grains; empty if nothing
     is."""
-    return "; ".join(filter(None, (scene.doubts(), _light(scene), _huge(scene), _far(scene), _bottomless(scene))))
+    return "; ".join(filter(None, (scene.doubts(), _density(scene), _huge(scene), _far(scene), _bottomless(scene))))
 
 
-def _light(scene: Scene) -> str:
-    """Of a density that would be one in g/cm^3."""
-    given = [float(part.given["density"].sample().min(initial=math.inf)) for part in scene.parts]
-    given += [body.density for body in scene.large_bodies if body.density is not None]
-    least = min(given + [source.density for source in scene.passages.sources.values()], default=math.inf)
-    return f"a density of {least:.3g} kg/m^3: is it in g/cm^3, which are 1000 kg/m^3?" if least < LIGHT else ""
+def _density(scene: Scene) -> str:
+    """Of densities that would be in g/cm^3, or that nothing has."""
+    large = [body.density for body in scene.large_bodies if body.density is not None]
+    sources = [source.density for source in scene.passages.sources.values()]
+    every = np.hstack([np.zeros(0), *(part.given["density"].sample() for part in scene.parts), *large, *sources])
+    least, most = every.min(initial=math.inf), every.max(initial=0.0)
+    light = f"a density of {least:.3g} kg/m^3: is it in g/cm^3, which are 1000 kg/m^3?" if least < LIGHT else ""
+    heavy = f"a density of {most:.3g} kg/m^3: no solid has more than 22600" if most > HEAVY else ""
+    return "; ".join(filter(None, (light, heavy)))
 
 
 def _huge(scene: Scene) -> str:

@@ -91,6 +91,15 @@ def contact_distance(scene: Scene) -> float:
     return max(smallest(scene) / PARTS, scene.reach)
 
 
+def distance_remark(scene: Scene, delta: float) -> str:
+    """Return what to say of a contact distance [m] that is more than the greatest grain; empty if it is not."""
+    widest = 2.0 * float(bodies.bounding_radius(scene.expected()).max(initial=0.0))
+    if delta <= max(widest, scene.reach) or not widest:
+        return ""
+    usual = f"0.05 of the smallest radius, {contact_distance(scene):.3g} m, is usual"
+    return f"delta {delta:g} m is more than the greatest grain, {widest:.3g} m: distant bodies become pairs; {usual}"
+
+
 def smallest(scene: Scene) -> float:
     """Return the half thickness of the thinnest grain [m]; 0.1 m if there is none."""
     half: Floats = bodies.least_half_thickness(scene.expected())

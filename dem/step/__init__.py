@@ -43,10 +43,11 @@ class Step:
         return self.impulse_on_large[self.world.large_row(name)] / self.system.dt
 
     def spring_force(self, name: str) -> Floats:
-        """Force (3,) of a spring on its second end, averaged over the step [N]; the first has the opposite one."""
+        """Force (3,) of a spring on its second end, averaged over the step [N]; the first has the opposite one.
+        ValueError if there is none of that name."""
         names = list(self.world.named["spring"])
         if name not in names:
-            raise KeyError(f"no spring {name!r}; there are: {', '.join(names) or 'none'}")
+            raise ValueError(f"no spring {name!r}; there are: {', '.join(names) or 'none'}")
         force: Floats = self.world.memory["spring"][names.index(name), :3] / self.system.dt
         return force
 

@@ -19,7 +19,7 @@ from petsc4py import PETSc
 
 from dem.compiled import loop
 from dem.contact_map import BlockRows, CompactRows
-from dem.exchange import on_each
+from dem.exchange import greatest, on_each
 from pctt.arrays import Array, all_from
 from pctt.ccp.accuracy import Accuracy, figures, measure
 from pctt.ccp.cones import FrictionCones, RollingCones
@@ -32,7 +32,7 @@ from pctt.ccp.registry import MATRIX, NEWTON, SOLVERS, why_no_form, why_refused
 from pctt.ccp.result import COULOMB, FIXED_POINT, LAWS, RELAXATION, Counts, Limits, Result, Status
 from pctt.ccp.unbounded import why_indefinite, why_unanswered, why_unbounded
 from pctt.log import phase
-from pctt.options import instance
+from pctt.options import function_or_none, instance, known_arguments, short
 
 __all__ = [
     "COULOMB",
@@ -61,7 +61,11 @@ __all__ = [
     "with_part",
 ]
 
+GRIPS = 10.0  #: more friction than anything has, and so with any tolerance
+STEEP = 0.1  #: mu tol; with 0.05 a sphere rolls as it should, with 0.5 it may roll backwards
 
+
+@known_arguments(limits=Limits)
 def solve(
     problem: ConeProblem,
     guess: Array | None = None,
@@ -89,12 +93,17 @@ def solve(
     Newton systems, keeps solvers and preconditioners from one problem to the next; ``monitor(iterations, residual)`` is
     called wherever the residual is known, on every rank. A problem without a solution has the status UNBOUNDED.
     """
-    if type not in SOLVERS:
+    if not isinstance(problem, ConeProblem):
+        raise ValueError(f"the problem {short(problem)}: allowed is a ConeProblem")
+    if not isinstance(type, str) or type not in SOLVERS:
         raise ValueError(f"the solver {type!r}: allowed are {', '.join(SOLVERS)}")
     if law not in LAWS:
         raise ValueError(f"the law {law!r}: allowed are {', '.join(LAWS)}")
     if why := why_refused(type, problem.cones.__class__):
         raise ValueError(f"the solver {type!r}: the problem has {why}")
+    if newton is not None and not isinstance(newton, Newton):
+        raise ValueError(f"newton {short(newton)}: allowed is what newton_for(comm, type, form) gives, or None")
+    function_or_none("monitor", monitor)
     if problem.cones.parts > 1 and newton is not None and newton.form != "body":
         raise ValueError(f"the Newton form {newton.form!r}: with {problem.cones.what} allowed is body")
     _refuse_form(type, newton.form if newton is not None else "")
@@ -102,6 +111,8 @@ def solve(
         allowed = ", ".join(name for name, method in SOLVERS.items() if method.needs != MATRIX)
         raise ValueError(f"the solver {type!r} reads rows of N, but N is given by its products; allowed are {allowed}")
     limits = watched(problem.comm, instance(Limits, "limits", limits), monitor)
+    if law == COULOMB and (steep := why_steep(greatest(problem.comm, float(problem.mu.max(initial=0.0))), limits.tol)):
+        raise ValueError(f"mu {steep}")
     options = instance(SOLVERS[type].options, "options", options, f" for {type}")
     start = problem.taken("a guess", problem.shown(np.zeros(problem.r.shape)) if guess is None else guess, finite=True)
     result = solved(problem, start, type, limits, options, newton, law)
@@ -109,6 +120,15 @@ def solve(
         _tell_states(problem, each)
         each.impulse = problem.shown(each.impulse)
     return result
+
+
+def why_steep(mu: float, tol: float) -> str:
+    """Why friction of this coefficient cannot be solved for with a tolerance; empty if it can. De Saxce's term is mu
+    times as large as slip, so that a residual of `tol` lets contacts close at mu tol times the speed of all."""
+    if mu <= max(STEEP / tol, GRIPS):
+        return ""
+    says = f"a residual of tol lets contacts close at {mu * tol:.1g} times the speeds of the problem"
+    return f"{mu:g} with tol {tol:g}: {says}; allowed is up to {max(STEEP / tol, GRIPS):.3g}, which holds as well"
 
 
 def watched(comm: MPI.Comm, limits: Limits, monitor: Callable[[int, float], None] | None = None) -> Limits:
@@ -244,6 +264,8 @@ def _print(comm: MPI.Comm, iterations: int, residual: float) -> None:
 def newton_for(comm: MPI.Comm, type: str, form: str = "auto", compare: Comparison | None = None) -> Newton:
     """Return the Newton systems that a method of SOLVERS works with; ``form`` is auto or of FORMS. ValueError for one
     that the method cannot have."""
+    if type not in SOLVERS:
+        raise ValueError(f"the solver {type!r}: allowed are {', '.join(SOLVERS)}")
     _refuse_form(type, form)
     if compare is not None and not compare.names:
         compare = None

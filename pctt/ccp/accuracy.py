@@ -18,6 +18,7 @@ from dem.exchange import reduced
 from pctt.arrays import TINY, Array
 from pctt.ccp.cones import FrictionCones
 from pctt.ccp.problem import ConeProblem
+from pctt.options import short
 
 ROUNDINGS = 8.0 * float(np.finfo(float).eps)
 
@@ -59,6 +60,8 @@ class Accuracy:
 def measure(problem: ConeProblem, impulse: Array) -> Accuracy:
     """Return the figures of an impulse (nc, 3), or (nc, 2) in the plane; the same on every rank. ValueError for another
     shape."""
+    if not isinstance(problem, ConeProblem):
+        raise ValueError(f"the problem {short(problem)}: allowed is a ConeProblem")
     g = problem.taken("impulses", impulse)
     return figures(problem, g, problem.velocity_of(problem.momentum(g)))
 

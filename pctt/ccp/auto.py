@@ -106,6 +106,7 @@ class Attempts:
                 result.status, result.reason = Status.UNBOUNDED, why
             else:
                 result.status, result.residual = Status.STALLED, np.inf
+                result.reason = f"impulses grow beyond {GROWN:g} times the size that r and N suggest"
                 result.impulse = np.zeros_like(result.impulse)
         self.all.append(result)
         return result

@@ -21,8 +21,9 @@ from scipy.sparse.csgraph import structural_rank
 from scipy.sparse.linalg import LinearOperator, splu
 
 from dem.contact_map import BlockRows, CompactRows, ContactMap
-from dem.exchange import on_any, on_each, reduced, refuse
+from dem.exchange import greatest, on_any, on_each, reduced, refuse
 from pctt.arrays import Array, all_from
+from pctt.blocks import unready
 from pctt.ccp.cones import Cones
 from pctt.ccp.delassus import BlockMap, ColumnMap, GivenMatrix, GivenOperator, rows_of
 
@@ -30,11 +31,14 @@ FULL = 10_000  # rows up to which N is found by a product with each unit vector,
 MOST = 50_000_000  # numbers of an N that is made by solves; of a larger one the diagonal blocks are kept
 BATCH = 300  # rows of N that are made together
 ALIKE = 1e-6  # of the largest entry of a matrix: by how much an entry may differ from its mirror image
+ABOUT = 1e-2  # of a block: by how much a product may differ from it
 #: types of Mats that have entries; others are known by their products
 WITH_ENTRIES = ("aij", "baij", "sbaij", "dense", "nest", "sell", "is")
 #: what is the same on all ranks, and the kinds of it
 COLLECTIVE = ("N", "G", "masses", "point", "key")
 KINDS = ("not given", "an object of PETSc", "a map of bodies", "a function or a factor", "a matrix", "a vector")
+LARGEST = 1e140  #: of what is squared and multiplied with each other, and summed: a fourth power would overflow
+
 MATRICES = "a two-dimensional array, a scipy sparse matrix, a PETSc Mat"
 
 Solve = Callable[[Array], Array]
@@ -87,8 +91,10 @@ def contacts_of(comm: MPI.Comm, r: Any, mu: Any, cones: Cones | None, **data: An
     contact of the plane has the friction 0 along its second tangent, in which nothing moves."""
     kinds = [kind_of(data.get(name)) for name in COLLECTIVE]
     N = data.pop("N", None)
-    parts = 1 if cones is None else cones.parts
-    if (mu is None) == (cones is None):
+    parts = cones.parts if isinstance(cones, Cones) else 1
+    if cones is not None and not isinstance(cones, Cones):
+        words = f"cones are of the type {type(cones).__name__}; allowed are FrictionCones and RollingCones of pctt.ccp"
+    elif (mu is None) == (cones is None):
         words = "a cone problem has either mu or cones"
     elif cones is not None:
         words = cones.why_refused() or _wrong_contacts(r, mu := cones.mu, parts=parts, **data)
@@ -147,6 +153,18 @@ def wrong_velocities(r: Any, shape: tuple[int, ...]) -> str:
     if np.shape(r) != shape:
         return f"r has the shape {np.shape(r)}; allowed is {shape}"
     return _wrong_contacts(r, np.zeros(shape[0]))
+
+
+def refuse_out_of_range(comm: MPI.Comm, r: Array, diagonal: float) -> None:
+    """ValueError on all ranks for velocities r of a problem with this mean of the diagonal of N if squares of them or
+    of the impulses overflow, or vanish: all residuals would be zero or no numbers."""
+    most = greatest(comm, float(np.abs(r).max(initial=0.0)))
+    if most and not all(1.0 / LARGEST <= size <= LARGEST for size in (most, diagonal, most / diagonal)):
+        raise ValueError(
+            f"r of up to {most:.1e} and N of {diagonal:.1e} (the mean of its diagonal): squares of velocities or "
+            f"impulses leave the range of double precision; allowed are r, N and r / N from {1.0 / LARGEST:g} to "
+            f"{LARGEST:g}, as other units may make them"
+        )
 
 
 def padded(rows: Array) -> Array:
@@ -316,7 +334,7 @@ def _by_products(comm: MPI.Comm, nc: int, width: int, N: Any) -> GivenOperator: 
     mult = _product(comm, N.mult, nc, width)
 
     def product(g: Array) -> Array:
-        return padded(on_each(comm, "N.mult", lambda: rows(np.ascontiguousarray(g[:, :width]))))
+        return padded(on_each(comm, "N.mult", lambda: rows(np.array(g[:, :width]))))  # which it may change
 
     def rows(g: Array) -> Array:
         y = np.asarray(mult(g), dtype=float)
@@ -332,6 +350,11 @@ def _by_products(comm: MPI.Comm, nc: int, width: int, N: Any) -> GivenOperator: 
     Nx, Nz = given.velocities(x), given.velocities(z)
     numbers = np.isfinite(Nx).all() and np.isfinite(Nz).all()
     refuse(comm, "" if numbers else "N.mult returns a NaN or an infinite number")
+    unit = np.zeros((nc, 3))
+    unit[:1, 0] = float(comm.rank == 0)
+    first = given.velocities(unit)[:1, :width] - unit[:1, :1] * blocks[:1, :, 0]
+    unlike = comm.rank == 0 and np.abs(first).max(initial=0.0) > ABOUT * np.abs(blocks[:1]).max(initial=0.0)
+    refuse(comm, "N.mult of the first contact's normal is not the first column of N.blocks[0]" if unlike else "")
     sums = comm.allreduce(np.array([np.vdot(z, Nx), np.vdot(x, Nz), np.vdot(x, x), np.vdot(Nz, Nz)]))
     if abs(sums[0] - sums[1]) > ALIKE * np.sqrt(sums[2] * sums[3]):
         raise ValueError(f"N.mult is not symmetric: x'Nz = {sums[1]:.6g} and z'Nx = {sums[0]:.6g}")
@@ -432,6 +455,8 @@ def _masses(comm: MPI.Comm, masses: Any, n: int) -> Array | tuple[Solve, bool]:
     together. ValueError on all ranks for others."""
     if masses is None:
         return np.ones(n)
+    if isinstance(masses, (PETSc.Vec, PETSc.Mat, PETSc.KSP)):
+        _refuse_unready(comm, "masses", masses)
     if isinstance(masses, PETSc.Vec):
         masses = _whole_vector(masses)
     elif isinstance(masses, PETSc.Mat):
@@ -575,8 +600,15 @@ def _check_shape(comm: MPI.Comm, name: str, shape: tuple[int, int], rows: int, c
     refuse(comm, f"{name} has the shape {shape}; allowed is {allowed}, rows of this rank's contacts" if wrong else "")
 
 
+def _refuse_unready(comm: MPI.Comm, name: str, thing: PETSc.Object) -> None:
+    """ValueError on all ranks if a Mat, Vec or KSP lacks something on any."""
+    lack = unready(thing)
+    refuse(comm, lack and f"{name} is a {type(thing).__name__} that {lack}; allowed is one that is ready for use")
+
+
 def _check_mat(comm: MPI.Comm, name: str, mat: PETSc.Mat, rows: int, columns: int | None) -> None:
-    """ValueError on all ranks if a Mat has other ranks or other rows than the contacts."""
+    """ValueError on all ranks if a Mat is not ready, or has other ranks or other rows than the contacts."""
+    _refuse_unready(comm, name, mat)
     same = MPI.Comm.Compare(comm, mat.comm.tompi4py()) in (MPI.IDENT, MPI.CONGRUENT)
     refuse(comm, "" if same else f"{name} is a Mat on other ranks than the problem; allowed are the same")
     size = mat.getLocalSize()

@@ -21,6 +21,7 @@ from pctt.ccp import door
 from pctt.ccp.cones import Cones, FrictionCones
 from pctt.ccp.cones.base import Units
 from pctt.ccp.delassus import BlockMap, GivenMatrix, GivenOperator, delassus, ritz_values, without_dense_columns
+from pctt.options import known_arguments, short
 
 
 class Errors(NamedTuple):
@@ -81,6 +82,7 @@ class ConeProblem:
     mean_diagonal : mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts
     """
 
+    @known_arguments()
     def __init__(
         self,
         comm: MPI.Comm,
@@ -95,11 +97,14 @@ class ConeProblem:
         key: np.ndarray | None = None,
         compliance: Array | float = 0.0,
     ):
+        if not isinstance(comm, MPI.Comm):
+            raise ValueError(f"comm {short(comm)}: allowed is a communicator of mpi4py, such as MPI.COMM_WORLD")
         data = {"N": N, "G": G, "masses": masses, "point": point, "key": key, "compliance": compliance}
         contacts = door.contacts_of(comm, r, mu, cones, **data)
         operator = door.operator_of(comm, len(contacts.r), contacts.width, N, G, masses)
         cones = FrictionCones(contacts.mu) if cones is None else cones
         self._begin(comm, contacts, cones, operator, point, key, compliance)
+        door.refuse_out_of_range(comm, self.r, self.mean_diagonal)
 
     @classmethod
     def of_bodies(
@@ -153,6 +158,7 @@ class ConeProblem:
         padded = door.padded(np.asarray(r, dtype=float).reshape(given.shape))
         other = self.with_r(padded if self.units is None else self.units * padded)
         other._given_r = padded
+        door.refuse_out_of_range(self.comm, other.r, self.mean_diagonal)
         return other
 
     def with_r(self, r: Array) -> ConeProblem:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pctt.arrays import Array
-from pctt.options import FRACTION, number, option
+from pctt.options import COUNT, FRACTION, PART, number, option
 
 if TYPE_CHECKING:
     from pctt.ccp.problem import Errors
@@ -48,9 +48,10 @@ class Limits:
         unit="m/s", check=("a positive number, or inf", lambda x: x > 0),
     )  # fmt: skip
     aim: float = number(
-        1.0, "where that pays, a method goes on to this part of the limits, for as many iterations as are spare"
-    )
-    spare: int = number(0, "the iterations for it; the conic method, which takes a few, needs none")
+        1.0, "where that pays, a method goes on to this part of the limits, for as many iterations as are spare",
+        check=PART,
+    )  # fmt: skip
+    spare: int = number(0, "the iterations for it; the conic method, which takes a few, needs none", check=COUNT)
     fallback: bool = option(True, "where the solver does not converge, another one goes on from its impulses")
     monitor: bool = option(False, "print the iterations and the residual wherever a solver looks at it")
     watch: Optional[Callable[[int, float], None]] = number(None, "it is told both, too, on every rank")

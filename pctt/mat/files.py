@@ -20,6 +20,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.exchange import on_first
+from pctt.blocks import refuse_unready
 from pctt.disk import read, write_rows
 from pctt.mat.grid_train import GridTrain
 from pctt.mat.order import Layout
@@ -36,6 +37,7 @@ def save(mat: PETSc.Mat, path: str | os.PathLike[str]) -> None:
     The file is whole at any moment: an old one stays until the new one is complete. The function of the entries is not
     saved. ValueError on all ranks for another Mat, and FileError if the file cannot be written.
     """
+    refuse_unready("pctt.mat.save", mat)
     matrix = compressed(mat)
     if matrix is None:
         raise ValueError(f"pctt.mat.save: a Mat of type {mat.getType()}; allowed is a Mat of pctt.mat.TensorTrain")

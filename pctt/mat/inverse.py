@@ -8,6 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from dem.exchange import on_first
+from pctt.blocks import refuse_unready
 from pctt.mat.entries import has_entries, multiplies
 from pctt.mat.grid_train import GridTrain
 from pctt.mat.order import layout_of
@@ -39,6 +40,7 @@ def inverse(A: PETSc.Mat, eps: float = 1e-6, max_rank: int = MAX_RANK) -> PETSc.
     >>> X.getPythonContext().error < 1e-8
     True
     """
+    refuse_unready("pctt.mat.inverse", A)
     comm = A.comm.tompi4py()
     options = Options(eps, max_rank)
     options.check(comm)

@@ -13,6 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dem.exchange import on_first, refuse
+from pctt.blocks import refuse_unready
 from pctt.mat.entries import Entries, Entry, diagonal, given, is_symmetric
 from pctt.mat.grid_train import GridTrain, rounded
 from pctt.mat.order import Layout, layout_of, whole_numbers
@@ -289,6 +290,7 @@ def axpy(Y: PETSc.Mat, factor: float, X: PETSc.Mat) -> None:
     >>> B.norm() < 1e-8 * A.norm()
     True
     """
+    refuse_unready("pctt.mat.axpy", Y, X)
     context, matrix = _context(Y), compressed(X)
     if context is None:
         raise ValueError(f"pctt.mat.axpy: Y is a Mat of type {Y.getType()}; allowed is a Mat of pctt.mat.TensorTrain")

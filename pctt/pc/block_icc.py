@@ -22,7 +22,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from pctt.blocks import shell_of
+from pctt.blocks import refuse_unready, shell_of
 from pctt.mat.order import Places, places_of
 from pctt.options import describe, option, read
 from pctt.pc.incomplete_cholesky import BAD_BLOCK, BAD_PIVOT, MOST, Array, Blocks, Factor, compile_loops, factorised
@@ -109,6 +109,7 @@ class BlockICC(Context):
         """ValueError on all ranks if the matrix is not square or has no entries, or if places do not fit it. If it is
         not positive definite, the KSP ends with PETSc's reason for a failed preconditioner."""
         start, (_, P) = time.perf_counter(), pc.getOperators()
+        refuse_unready(self.name, *pc.getOperators())
         rows, columns = P.getSize()
         if rows != columns:
             raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")

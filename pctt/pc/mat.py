@@ -32,7 +32,7 @@ def is_symmetric(P: PETSc.Mat) -> bool:
     for one, other in ((u, v), (v, u)):
         P.mult(one, product)
         values.append(other.dot(product))
-    size = product.norm()
+    size = product.norm(PETSc.NormType.NORM_INFINITY) * P.getSize()[0] ** 0.5  # squares of small numbers would vanish
     for vec in (u, v, product):
         vec.destroy()
     return bool(P.comm.tompi4py().bcast(abs(values[0] - values[1]) <= 1e-8 * size or not np.isfinite(size)))

@@ -14,7 +14,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import block_diagonal, diagonal_matrix
+from pctt.blocks import block_diagonal, diagonal_matrix, refuse_unready
 from pctt.mat.entries import diagonal_blocks, has_entries
 from pctt.mat.order import Places, places_of
 from pctt.options import describe, read
@@ -109,6 +109,7 @@ class TensorTrain(Context):
     def setUp(self, pc: PETSc.PC) -> None:
         """ValueError on all ranks if the matrix is not square or has no entries, or if places do not fit it."""
         _, P = pc.getOperators()
+        refuse_unready(self.name, *pc.getOperators())
         rows, columns = P.getSize()
         if rows != columns:
             raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")

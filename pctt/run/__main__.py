@@ -41,7 +41,7 @@ from pctt.ksp_options import entered, mark_used, refuse_stray, taken_over
 from pctt.options import OptionError
 from pctt.petsc import options_database
 from pctt.run.help import help_text
-from pctt.run.interrupt import InterruptError, catch_signals
+from pctt.run.interrupt import InterruptError, take_signals
 from pctt.run.options import read_options
 from pctt.run.settings import DEMO_SOLVERS
 from pctt.run.simulate import NotConvergedError, simulate, solve_file
@@ -113,7 +113,7 @@ def run() -> int:
     solved; 130, the status of Ctrl-C in shells, if a signal has ended the run. One message says what went wrong. Other
     errors abort all ranks."""
     comm = MPI.COMM_WORLD.Dup()  # a message of a user's scene meets none of ours
-    catch_signals(comm)
+    take_signals()
     try:
         if other := first_differing_rank(comm, repr((sys.argv[1:], sorted(options_database().items())))):
             raise OptionError(f"rank {other} has other options than rank 0; allowed are the same options on all ranks")

@@ -1,7 +1,8 @@
 """Ctrl-C and other signals that end a run: all ranks finish the present step, write the checkpoint and end together.
 
 A signal reaches the ranks at different moments, or one rank only. So each rank notes it, and after every step the ranks
-tell each other. The same signal once more ends the rank at once.
+tell each other. The same signal once more ends the rank at once, and so does any before the first step, when nothing
+is there to be kept: it might take hours until somebody looks.
 """
 
 from __future__ import annotations
@@ -20,14 +21,24 @@ from mpi4py import MPI
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP, signal.SIGXCPU)
 
 _noted: list[int] = []
+_taken: set[int] = set()  #: the signals that the program has taken
 
 
 class InterruptError(RuntimeError):
     """A run that was asked to end; the message says how to go on. Raised on all ranks alike."""
 
 
-def catch_signals(comm: MPI.Comm) -> None:
-    """From now on note signals instead of ending by them."""
+def take_signals() -> None:
+    """From now on signals end this process at once, without the pages of PETSc and of Python."""
+    for number in SIGNALS:
+        ignored = number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN  # under nohup
+        signal.signal(number, signal.SIG_IGN if ignored else signal.SIG_DFL)
+        _taken.update(() if ignored else (number,))
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it without a word; PETSc would print a page
+
+
+def note_signals(comm: MPI.Comm) -> None:
+    """From now on note the signals that the program has taken, instead of ending by them: steps begin."""
 
     def note(number: int, frame: FrameType | None) -> None:
         signal.signal(number, signal.SIG_DFL)
@@ -36,10 +47,8 @@ def catch_signals(comm: MPI.Comm) -> None:
             sys.stderr.flush()
         _noted.append(number)
 
-    for number in SIGNALS:
-        ignored = number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN  # under nohup
-        signal.signal(number, signal.SIG_IGN if ignored else note)
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it without a word; PETSc would print a page
+    for number in _taken:
+        signal.signal(number, note)
 
 
 def is_requested(comm: MPI.Comm) -> bool:

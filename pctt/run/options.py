@@ -83,13 +83,13 @@ def _read_scene(name: str, scene_class: type[Experiment], database: Mapping[str,
     """The scene with the options of the database. OptionError if it refuses one, or has bad numbers of its own."""
     try:
         scene = read(scene_class, database, "scene_")
+        _refuse_bad_numerics(name, scene)
     except OptionError:
         raise
     except ValueError as error:
         if not str(error).startswith(tuple(field.name for field in dataclasses.fields(scene_class))):
             raise
         raise OptionError(f"-scene_{error}") from None
-    _refuse_bad_numerics(name, scene)
     return scene
 
 
@@ -161,13 +161,15 @@ def _refuse_for_petsc(database: Mapping[str, str], form: str, compare: ccp.Compa
     comm = compare.comm
     given = {n: spelt for n, spelt in solver_options(database).items() if n.startswith(("ksp_", "pc_"))}
     for name, (allowed, holds) in TOLERANCES.items():
-        spelt = given.get(name, "")
+        if name not in given:
+            continue
+        spelt = given[name]
         try:
-            value = float(database.get(spelt) or 0.0)
+            value = float(database[spelt] or "nan")
         except ValueError:
             continue  # PETSc says what is no number
         if not holds(value):
-            raise OptionError(f"-{spelt} {database[spelt]}: allowed is {allowed}")
+            raise OptionError(f"{f'-{spelt} {database[spelt] or str()}'.rstrip()}: allowed is {allowed}")
     ksps = []
     later = INCOMPLETE if form == "contact" and "pc_type" not in given else {}
     try:

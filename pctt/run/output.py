@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dem import bodies
+from dem import bodies, checks
 from dem.exchange import exchange
 from dem.experiment import Experiment
 from dem.model.world import World
@@ -274,8 +274,11 @@ class Writer:
         if self.comm.rank > 0:
             return {}
         records = self.folder.records()
-        found = scene.analyse(records)
-        figures = {name: float(value) for name, value in found.items() if np.ndim(value) == 0}
+        found: Any = scene.analyse(records)
+        if not isinstance(found, Mapping):
+            raise ValueError(f"analyse must return a dict of numbers and arrays by name, not {type(found).__name__}")
+        single = {name: value for name, value in found.items() if np.ndim(value) == 0}
+        figures = {name: checks.number(f"analyse returns {name!r}", value) for name, value in single.items()}
         series = {name: np.asarray(value) for name, value in found.items() if name not in figures}
         if series:
             leading = {name: records[name] for name in list(records)[:2]}

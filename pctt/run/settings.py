@@ -177,7 +177,10 @@ class Settings(ccp.Limits):
         stiffness = math.inf if paper else self.stiffness
         dt = time_step.recommended(scene) if self.dt is None else self.dt
         delta = time_step.contact_distance(scene) if self.delta is None else self.delta
-        resists = scene.pairs(np.inf).resists
+        pairs = scene.pairs(np.inf)
+        resists, friction = pairs.resists, float(np.maximum(pairs.friction, pairs.static_friction).max())
+        if self.law == ccp.COULOMB and (steep := ccp.why_steep(friction, self.tol)):
+            raise OptionError(f"friction {steep}")
         if why := why_refused(self.solver, ccp.RollingCones if resists else ccp.FrictionCones):
             raise OptionError(f"solver {self.solver}: the scene has {why}")
         if resists and self.newton == "contact":
@@ -211,6 +214,7 @@ class Run:
     restart: str = option(
         "",
         "file to start from: checkpoint.h5 of a run; settled: the scene's settled state, made at first use",
+        check=("the name of a file, or settled", bool),
     )
     settle: bool = option(False, "make the scene's settled state with APGD, keep it in the cache, and stop")
     output: str = option(
@@ -225,12 +229,17 @@ class Run:
     checkpoint_minutes: Optional[float] = option(
         None, "time between two checkpoints by the clock, in place of -checkpoint_every", unit="min", check=NOT_NEGATIVE
     )
-    problem: str = option("", "FCLIB file with a cone problem to solve instead of a scene")
-    dump_problem: str = option("", "folder for the steps' cone problems as FCLIB files")
+    problem: str = option(
+        "", "FCLIB file with a cone problem to solve instead of a scene", check=("the name of a file", bool)
+    )
+    dump_problem: str = option(
+        "", "folder for the steps' cone problems as FCLIB files", check=("the name of a folder", bool)
+    )
     compare: str = option(
         "",
         "preconditioners TYPE or LABEL:TYPE, with commas between, that each solve the same Newton systems; options of "
         "one have the prefix compare_LABEL_",
+        check=("one or more of them", lambda text: bool(text.strip(","))),
     )
     compare_every: int = option(1, "compare on every k-th Newton system", check=AT_LEAST_ONE)
     threads: int = option(1, "threads of each rank for the loops of the solver, where ranks have several cores",

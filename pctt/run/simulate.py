@@ -91,6 +91,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
         progress.doing(sim.steps, sim.time, end)
 
     progress.doing(sim.steps, sim.time, end)
+    interrupt.note_signals(sim.comm)
     sim.run(steps=steps, call=say, stop=lambda sim: interrupt.is_requested(sim.comm))
     if sim.steps < end:
         words = _how_to_go_on(options, output.checkpoint, end - sim.steps, settings.dt)
@@ -173,6 +174,8 @@ def _solve(stored: Stored, options: Options, compare: ccp.Comparison, newton: cc
         used = result.solver or settings.solver
         by_newton = ccp.SOLVERS[used].newton
         systems = "; ".join(filter(None, (newton.linear.words(), newton.linear.what()))) if by_newton else ""
+    except ValueError as error:
+        raise OptionError(f"-problem {options.run.problem}: {error}") from None
     finally:
         newton.destroy()
     seconds = log.take_seconds(("solve", "compare"))

@@ -32,6 +32,7 @@ from dem.step.impulses import ImpulseMemory
 from dem.together import SceneError, first_differing_rank, together
 from pctt import ccp, json_text
 from pctt.disk import FileError, Lock, on_first, read, same_rows, texts, write_rows
+from pctt.memory import available
 from pctt.options import OptionError
 from pctt.petsc import warn
 from pctt.run import interrupt
@@ -41,6 +42,9 @@ from pctt.run.stepper import Stepper
 
 CONTACTS = ("contacts/key", "contacts/impulse")  #: the data sets that have a row for each contact
 FORMAT = "pctt checkpoint 4"
+
+#: Memory of a grain at the start and in a step of a dense bed [bytes], measured in a mixer (docs/cluster.md).
+START_BYTES, STEP_BYTES = 600, 3200
 
 Say = Callable[[str], object]  #: told on the first rank
 
@@ -60,8 +64,20 @@ def built(scene: Experiment, comm: MPI.Comm) -> Scene:
     if other := first_differing_rank(comm, words, numbers):
         allowed = "allowed is the same scene on all ranks (random numbers need a seed, and no rank a part of its own)"
         raise SceneError(f"{what}: rank {other} has built other bodies or materials than rank 0; {allowed}")
+    _refuse_too_large(what, found.count, comm)
     found.survey(comm)
     return found
+
+
+def _refuse_too_large(what: str, count: int, comm: MPI.Comm) -> None:
+    """SceneError if the ranks have no memory for so many grains, a warning if hardly; collective."""
+    there = available(comm) * comm.size
+    needed, words = count * STEP_BYTES, f"{what}: {count:.4g} grains need about"
+    has = f"{there / 1e9:.3g} GB that there are; take fewer grains, or more nodes"
+    if count * START_BYTES > there:
+        raise SceneError(f"{words} {needed / 1e9:.3g} GB of memory, and cannot even start in the {has}")
+    if needed > there:
+        warn(comm, f"{words} {needed / 1e9:.3g} GB of memory once they lie on each other, more than the {has}")
 
 
 def _facts(scene: Scene) -> tuple[str, list[Floats]]:
@@ -348,8 +364,6 @@ def _exclusive(path: Path, comm: MPI.Comm, say: Say) -> Iterator[None]:
             if not waits:
                 say(f"waits for another run that settles the same scene, {path}")
             waits = True
-            if interrupt.is_requested(comm):
-                raise interrupt.InterruptError("interrupted while another run settled the scene")
             time.sleep(0.2)
         yield
     finally:
@@ -378,6 +392,7 @@ def _settle(
             say(f"  goes on after step {world.step}, from {unfinished(path)}")
         except FileError as error:
             say(f"  {error}; settled from the beginning")
+    interrupt.note_signals(comm)
     with Stepper(loose, world, memory) as stepper:
         while world.step < end:
             if world.step + 1 >= end - end // 10:

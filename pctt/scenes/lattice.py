@@ -20,6 +20,8 @@ from dem.record.analysis import calm
 from dem.scene import Scene
 from dem.shapes import Plane, Shape
 
+LONGEST = 2**28  #: places of a lattice that one rank makes one after another, five million in a second
+
 
 @dataclass(frozen=True)
 class Spheres(Experiment):
@@ -51,7 +53,14 @@ class Spheres(Experiment):
 
     def highest(self) -> float:
         """Height of the highest centre at the start [m]."""
-        return max(float(part[:, 2].max()) for _, part in self.positions().chunks())
+        return max(float(part[:, 2].max()) for _, part in self.walk(self.positions()))
+
+    def walk(self, places: Rule) -> Iterator[tuple[int, Floats]]:
+        """The chunks of all places, of which one rank alone makes one after another. ValueError if that takes more than
+        a minute."""
+        if len(places) > LONGEST:
+            self.refuse("n", f"asks for {len(places):.2g} places of spheres; allowed are {LONGEST:.2g} in this scene")
+        return places.chunks()
 
     def spheres_alone(self, radius: float | Rule, material: str = "default") -> Scene:
         """A scene with the spheres, of one radius or of radii (spheres,) [m]."""
@@ -144,7 +153,7 @@ class SmallSpheres(Spheres):
 
         def inside() -> Iterator[tuple[Ints, Floats]]:
             """The layers (n,) of places (n, 3) in the container, which do not overlap in height."""
-            for first, part in places.chunks():
+            for first, part in self.walk(places):
                 row = np.flatnonzero(length(np.delete(part, axis, axis=1)) <= self.room)
                 yield (first + row) % layers, part[row]
 

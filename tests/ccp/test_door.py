@@ -440,3 +440,72 @@ def test_ranks_that_give_other_kinds_or_fail_alone_end_together():
         ccp.solve(case.problem(N=N), monitor=lambda *at: {}["one"] if one else None)
     with pytest.raises(ValueError, match=r"a guess of no numbers.*on rank 1"):
         ccp.solve(case.problem(N=N), "none" if one else None)
+
+
+@pytest.mark.parametrize("scale", [1e-310, 1e-150, 1e150, 1e300])
+def test_numbers_whose_squares_leave_double_precision_are_refused(scale):
+    case = Case()
+    one, words = case.problem(N=case.N), "squares of velocities or impulses leave the range of double precision"
+    with pytest.raises(ValueError, match=words):
+        case.problem(N=scale * case.N)
+    with pytest.raises(ValueError, match=words):
+        one.with_velocities(scale * case.r)
+    with pytest.raises(ValueError, match=words):
+        ccp.ConeProblem(SELF, scale * case.r, case.mu, N=case.N)
+
+
+@pytest.mark.parametrize("power", [-300, 300])
+def test_units_within_the_range_change_nothing(power):
+    """Powers of two have no rounding, and nothing closes where r is zero."""
+    case, size = Case(), 2.0**power
+    first, other = (ccp.solve(case.problem(N=c * case.N), limits=LIMITS) for c in (1.0, size))
+    assert first.converged
+    assert other.converged
+    assert np.array_equal(size * other.impulse, first.impulse)
+    assert not ccp.solve(case.problem(N=size * case.N).with_velocities(0.0 * case.r)).impulse.any()
+
+
+def test_friction_that_the_tolerance_does_not_resolve_is_refused():
+    """A contact would count as closed by the slip that the tolerance leaves."""
+    case = Case()
+    problem = ccp.ConeProblem(SELF, case.r, 1e8 * case.mu, N=case.N)
+    with pytest.raises(ValueError, match=r"mu .*e\+07 with tol 0.0001: .*allowed is up to 1e\+03"):
+        ccp.solve(problem)
+    assert ccp.solve(problem, law=ccp.RELAXATION, limits={"max_it": 1}).status is not ccp.Status.BREAKDOWN
+
+
+def test_calls_with_what_they_cannot_take():
+    case = Case()
+    problem = case.problem(N=case.N)
+    for words, call in {
+        "the problem 3: allowed is a ConeProblem": lambda: ccp.solve(3),
+        "the problem None: allowed is a ConeProblem": lambda: ccp.measure(None, case.r),
+        "newton 'body': allowed is what newton_for": lambda: ccp.solve(problem, newton="body"),
+        r"the solver \['apgd'\]: allowed are": lambda: ccp.solve(problem, type=["apgd"]),
+        "the solver 'none': allowed are": lambda: ccp.newton_for(SELF, "none"),
+        "monitor 3: allowed is a function": lambda: ccp.solve(problem, monitor=3),
+        "aim -1: allowed is a number above 0": lambda: ccp.solve(problem, limits={"aim": -1}),
+        "cones are of the type list": lambda: ccp.ConeProblem(SELF, case.r, cones=[0.5], N=case.N),
+        r"not the first column of N.blocks\[0\]": lambda: case.problem(N=ccp.Operator(case.mult, 2.0 * case.blocks)),
+        "comm .*: allowed is a communicator of mpi4py": lambda: ccp.ConeProblem(case.r, case.mu, N=case.N),
+    }.items():
+        with pytest.raises(ValueError, match=words):
+            call()
+    for words, call in {
+        r"solve: there is no argument 'tol'; .*; limits has it: limits={'tol': ...}": lambda: ccp.solve(problem, tol=1),
+        "solve: there is no argument 'gues'; .*; did you mean guess": lambda: ccp.solve(problem, gues=case.r),
+        "ConeProblem: there is no argument 'M'; allowed are comm, r": lambda: ccp.ConeProblem(SELF, case.r, M=case.N),
+    }.items():
+        with pytest.raises(TypeError, match=words):
+            call()
+
+
+def test_an_operator_may_change_its_argument():
+    case = Case()
+
+    def in_place(g):
+        g[:] = case.mult(g)
+        return g
+
+    one, other = (ccp.solve(case.problem(N=ccp.Operator(mult, case.blocks))) for mult in (case.mult, in_place))
+    assert np.array_equal(one.impulse, other.impulse)

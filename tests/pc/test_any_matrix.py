@@ -10,10 +10,14 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from petsc4py import PETSc
 from systems import contact_matrix, contacts
 from train_solver import context, poisson, ready, report, solve, solver
 
+from pctt.blocks import block_diagonal
+from pctt.ccp import ConeProblem
+from pctt.mat import axpy, inverse, save
 from pctt.pc.mat import is_symmetric
 from pctt.petsc import own_errors
 
@@ -53,6 +57,42 @@ def test_all_types_of_matrices_give_the_same_preconditioner(rank):
     assert max(its) - min(its) <= 2
 
 
+def unready_mats() -> dict[str, PETSc.Mat]:
+    """Mats with which PETSc's own functions may end in a segmentation fault, by what they are."""
+    sized, unassembled = PETSc.Mat().create(), PETSc.Mat().createAIJ((6, 6), nnz=1)
+    sized.setSizes((6, 6))
+    unassembled.setValue(0, 0, 1.0)
+    destroyed = PETSc.Mat().createAIJ((6, 6), nnz=1).destroy()
+    lack = "has no type or no sizes"
+    return {"never created": PETSc.Mat(), "or is destroyed": destroyed, lack: sized, "is not assembled": unassembled}
+
+
+@pytest.mark.parametrize("kind", ["BlockICC", "TensorTrain"])
+def test_a_matrix_that_is_not_ready_is_refused_by_all_that_take_one(kind):
+    good = filled("aij")
+    x, b = good.createVecs()
+    r, mu = np.ones((2, 3)), np.ones(2)
+    for words, mat in unready_mats().items():
+        ksp = PETSc.KSP().create()
+        ksp.setOperators(good, mat)
+        ksp.pc.setType("python")
+        ksp.pc.setPythonType(f"pctt.pc.{kind}")
+        with refused(f"pctt.pc.{kind}: the Mat " + ("" if mat.handle else "has no type or no sizes")):
+            ksp.solve(b, x)
+        ksp.destroy()
+        for call in (inverse, lambda mat: save(mat, "file.h5"), lambda mat: axpy(mat, 1.0, mat), block_diagonal):
+            with refused(words):
+                call(mat)
+        for given in ({"N": mat}, {"G": mat, "masses": np.ones(6)}, {"G": np.eye(6), "masses": mat}):
+            with refused(f"is a Mat that .*{words}"):
+                ConeProblem(MPI.COMM_SELF, r, mu, **given)
+    with refused("pctt.mat.inverse: the Mat is a str; allowed is an assembled Mat"):
+        inverse("mat")
+    for masses in (PETSc.Vec(), PETSc.Vec().create(), PETSc.KSP(), PETSc.KSP().create()):
+        with refused(f"masses is a {type(masses).__name__} that "):
+            ConeProblem(MPI.COMM_SELF, r, mu, G=np.eye(6), masses=masses)
+
+
 def test_a_matrix_without_entries_or_of_another_shape_is_refused():
     shell = PETSc.Mat().createPython((9, 9), type("Shell", (), {"mult": lambda *_: None})())
     shell.setUp()
@@ -80,6 +120,16 @@ def test_bad_coordinates_are_refused_at_set_up(points, words):
     ksp = solver(mat)
     with refused(f"{words}.*allowed are finite numbers of shape"):
         ksp.setUp()
+
+
+@pytest.mark.parametrize("scale", [1e-290, 1.0, 1e290])
+def test_symmetry_does_not_depend_on_units(scale):
+    mat = filled("dense")
+    mat.scale(scale)
+    assert is_symmetric(mat)
+    mat.setValue(0, 1, 10.0 * abs(mat.getValue(0, 0)))
+    mat.assemble()
+    assert not is_symmetric(mat)
 
 
 def test_a_matrix_that_is_not_symmetric_is_said_to_be_so():

@@ -214,7 +214,7 @@ def test_values_with_blanks_are_taken_whole(program, tmp_path):
 
 
 def test_what_petsc_cannot_hold_is_refused(program, results, monkeypatch):
-    assert refused(program, results, "-output", "") == "pctt.run: -output : allowed is the name of a folder"
+    assert refused(program, results, "-output", "") == "pctt.run: -output: allowed is the name of a folder"
     assert "r?sultats: has bytes that are no text" in refused(program, results, "-output", "r\udce9sultats", own=True)
     monkeypatch.setenv("PETSC_OPTIONS", "-output 'my runs'")
     assert "PETSC_OPTIONS -output 'my runs': has a single quote" in refused(program, results, "-steps", "1")

@@ -100,19 +100,28 @@ def test_the_same_signal_again_ends_a_run_at_once(program, tmp_path, cache):
     assert "interrupted" not in said
 
 
-def test_a_terminal_that_goes_away_and_the_limit_of_processor_time_end_a_run_as_others_do(monkeypatch):
+def test_signals_end_the_program_at_once_before_its_steps_and_then_after_one(monkeypatch):
+    """A terminal that goes away and the limit of processor time are as others; what Python has made is not taken."""
     before = {number: signal.getsignal(number) for number in interrupt.SIGNALS}
     monkeypatch.setattr(interrupt, "_noted", [])
+    monkeypatch.setattr(interrupt, "_taken", set())
     try:
+        interrupt.note_signals(MPI.COMM_SELF)
+        assert all(signal.getsignal(number) is handler for number, handler in before.items())
+        interrupt.take_signals()
+        assert all(signal.getsignal(number) is signal.SIG_DFL for number in (signal.SIGINT, signal.SIGTERM))
         signal.signal(signal.SIGHUP, signal.SIG_DFL)  # these tests may run under nohup
-        interrupt.catch_signals(MPI.COMM_SELF)
+        interrupt.take_signals()
+        interrupt.note_signals(MPI.COMM_SELF)
         for number in (signal.SIGHUP, signal.SIGXCPU):
             os.kill(os.getpid(), number)
             assert signal.getsignal(number) is signal.SIG_DFL  # once more, and it ends at once
         assert interrupt._noted == [signal.SIGHUP, signal.SIGXCPU]
         assert interrupt.is_requested(MPI.COMM_SELF)
+        interrupt._taken.clear()
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
-        interrupt.catch_signals(MPI.COMM_SELF)
+        interrupt.take_signals()
+        interrupt.note_signals(MPI.COMM_SELF)
         os.kill(os.getpid(), signal.SIGHUP)
         assert interrupt._noted == [signal.SIGHUP, signal.SIGXCPU]
     finally:

@@ -13,7 +13,10 @@ import pytest
 
 import pctt
 from dem.shapes import Plane
+from dem.together import SceneError
 from pctt.ccp.first_order.scaled import ScaledProblem
+from pctt.run import state
+from pctt.scenes import Drum, Mixer, Wheel
 
 STEPS = 70
 WARM = 0.4  #: part of the steps in which arrays grow with the contacts, and loops are loaded
@@ -114,3 +117,14 @@ def test_iterations_of_a_step_hold_few_bytes_per_contact(monkeypatch):
         contacts = sim.figures["contacts"]
     assert contacts > 2500
     assert 0 < max(most) < 1150 * contacts
+
+
+def test_a_scene_that_no_memory_holds_is_refused_before_its_grains_are_made(monkeypatch):
+    with pytest.raises(SceneError, match=r"8e\+15 grains need about 2.56e\+10 GB of memory, and cannot even start"):
+        pctt.Simulation(Mixer(n=99999))
+    for scene in (Wheel, Drum):
+        with pytest.raises(ValueError, match=r"^n 99999 asks for .* places of spheres; allowed are 2.7e\+08"):
+            assert scene(n=99999).settling_time
+    monkeypatch.setattr(state, "available", lambda comm: 3e4)
+    with pytest.warns(UserWarning, match="27 grains need about 8.64e-05 GB of memory once they lie on each other"):
+        pctt.Simulation(Mixer(n=1)).close()

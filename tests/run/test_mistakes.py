@@ -14,7 +14,8 @@ import pctt
 from dem.together import SceneError
 from pctt import Box, Dynamic, Fixed, Glide, Mesh, Plane, Rotation, Scene, Simulation, measures
 from pctt.disk import FileError
-from pctt.options import OptionError
+from pctt.options import OptionError, read
+from pctt.run.settings import Run
 from pctt.scenes import Mixer
 
 
@@ -167,9 +168,10 @@ def drained():
     (walled(), "the grains fall for ever"),
     (repeated(1.0, 1.0, None), "the grains fall for ever"),
     (repeated(None, None, 1.0), ""),  # they do, and are seen to
+    (floored(density=1e9), r"a density of 1e\+09 kg/m.3: no solid has more than 22600"),
     (floored(stiffness=1.0), "contacts are so soft that .* half thicknesses. What helps: a larger stiffness="),
     (tooled(), ""),
-    (floored(), ""), (floored(friction=1e6), ""), (hung(), ""), (drained(), ""), (bare(gravity=(0, 0, 0)), ""),
+    (floored(), ""), (floored(friction=150.0), ""), (hung(), ""), (drained(), ""), (bare(gravity=(0, 0, 0)), ""),
 ])  # fmt: skip
 def test_what_is_likely_a_mistake_is_told_before_the_first_step(scene, words):
     with warnings.catch_warnings(record=True) as told:
@@ -178,6 +180,56 @@ def test_what_is_likely_a_mistake_is_told_before_the_first_step(scene, words):
     found = [str(each.message) for each in told if each.category is UserWarning]
     assert len(found) == bool(words), found
     assert all(re.match(words, each) for each in found), found
+
+
+def test_friction_and_contact_distances_beyond_the_rest_of_the_scene():
+    """With a coefficient of 1000 and the usual tolerance a sphere that should roll may go backwards."""
+    with pytest.raises(OptionError, match="friction 1000 with tol 0.0005: .* allowed is up to 200"):
+        Simulation(floored(friction=1e3))
+    with pytest.warns(UserWarning, match=r"delta 100 m is more than the greatest grain, 0.1 m: .* 0.0025 m, is usual"):
+        sim = Simulation(falling(), delta=100.0)
+    with pytest.raises(ValueError, match="friction 1000 with tol"):
+        sim.change("pair glass, default", friction=1e3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Simulation(falling(), delta=0.1)
+
+
+def test_calls_with_what_they_cannot_take(tmp_path):
+    scene = falling()
+    scene.add_spring("rope", 0, 1, stiffness=1.0)
+    sim = Simulation(scene, dt=0.01)
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    sim.run(steps=1, call=None)
+    for words, call in {
+        r"run\(call=...\) 3: allowed is a function": lambda: sim.run(steps=1, call=3),
+        r"run\(until=...\): allowed is one number": lambda: sim.run(until=[1, 2]),
+        "no spring 'x'; there are: rope": lambda: sim.spring_force("x"),
+        "body floor: no values; allowed are some by name": lambda: sim.change("body floor"),
+        "change 3: allowed is a kind and a name": lambda: sim.change(3, speed=1.0),
+        r"load\(''\): allowed is the name of a file": lambda: Simulation.load("", scene),
+        r"save\(3\): allowed is the name of a file": lambda: sim.save(3),
+        "restart 3: allowed is the name of a checkpoint": lambda: Simulation(scene, restart=3),
+        r"scale of .*a.obj: allowed is one number, got \(1, 2\)": lambda: Mesh.read(tmp_path / "a.obj", scale=(1, 2)),
+        "file of a mesh 3: allowed is the name of a file": lambda: Mesh.read(3),
+        "n 1.5: allowed is a whole number": lambda: Mixer(n=1.5),
+        "radius '0.1': allowed is a number": lambda: Mixer(radius="0.1"),
+        "comm 3: allowed is a communicator of mpi4py": lambda: Simulation(scene, comm=3),
+        "period must have three entries, for x, y and z, got 1.0": lambda: Scene(0.5, period=1.0),
+        "friction None: allowed is a number >= 0": lambda: Scene(None),
+        "overwrite 'no': allowed is true or false": lambda: sim.write(tmp_path / "run", overwrite="no"),
+        "decay 0: allowed is a number above 0, up to 1": lambda: Simulation(scene, solver="apgd", options={"decay": 0}),
+    }.items():
+        with pytest.raises(ValueError, match=words):
+            call()
+    with pytest.raises(TypeError, match="run: there is no argument 'time'; allowed are until, steps, stop, every"):
+        sim.run(time=1.0)
+
+
+@pytest.mark.parametrize("name", ["restart", "problem", "dump_problem", "compare", "output"])
+def test_an_option_without_a_value_is_refused(name):
+    with pytest.raises(OptionError, match=f"^-{name}: allowed is "):
+        read(Run, {name: ""})
 
 
 @pytest.mark.parallel(1, 2)

@@ -159,8 +159,8 @@ def drop(tmp_path, monkeypatch):
 
     run(DROP)
 
-    def go_on(text, **options):
-        return run(text, **{"restart": "out/checkpoint.h5", **options})
+    def go_on(text, restart="out/checkpoint.h5", **options):
+        run(text, **options, **({"restart": restart} if restart else {}))
 
     return go_on
 

@@ -91,6 +91,9 @@ FAULTS = {
     "no large body 'lid'": GOOD + "    def record(self, step):\n        return {'z': step.position('lid')[2]}\n",
     "that is not in use": GOOD + "    def record(self, step):\n        return {'step': 1}\n",
     "allowed is a number": GOOD + "    def record(self, step):\n        return {'z [m]': [1, 2]}\n",
+    "record returns 'z': allowed are": GOOD + "    def record(self, step):\n        return {'z': 1j}\n",
+    "analyse returns 'z': allowed are": GOOD + "    def analyse(self, records):\n        return {'z': 'x'}\n",
+    "analyse must return a dict": GOOD + "    def analyse(self, records):\n        return None\n",
     "analyse of the scene One: KeyError": GOOD + "    def analyse(self, records):\n        return records['z']\n",
     "has no settling_time": GOOD,
 }

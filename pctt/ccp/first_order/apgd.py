@@ -30,7 +30,7 @@ from pctt.arrays import Array
 from pctt.ccp.first_order.scaled import FirstOrder, Progress, ScaledProblem
 from pctt.ccp.problem import ConeProblem
 from pctt.ccp.result import Limits, Result
-from pctt.options import number
+from pctt.options import AT_LEAST_ONE, NOT_NEGATIVE, PART, POSITIVE, number
 
 IMPATIENT = 300  # iterations without progress in single precision: double precision takes over
 CACHED = 500  # contacts whose numbers stay in the cache, where single precision is no faster
@@ -42,18 +42,33 @@ class APGD(FirstOrder):
     """The numbers of the method, set from Python. L is the estimate of the curvature along a step; its inverse is the
     step's length."""
 
-    check: int = number(25, "most iterations between two looks at the natural residual")
-    lipschitz: float = number(2.5, "the first L: A has a diagonal of about one, and on packings L is 2 to 3")
-    margin: float = number(1.3, "L of a repeated step, over the curvature found: the next need not be repeated too")
-    decay: float = number(0.99, "factor on L after each step, so that steps grow again where the curvature allows it")
-    theta: float = number(0.2, "where momentum begins: below 1, as steps are short for most directions of descent")
-    damping: float = number(0.1, "Coulomb's law: 1 - the greatest momentum, at most; docs/notebook_ccp.md has trials")
-    near: float = number(0.03, "the same at least, where the impulses have gone a way of little curvature")
-    growth: float = number(6.0, "Coulomb's law: of a squared step over the least one, where momentum begins anew")
+    check: int = number(25, "most iterations between two looks at the natural residual", check=AT_LEAST_ONE)
+    lipschitz: float = number(
+        2.5, "the first L: A has a diagonal of about one, and on packings L is 2 to 3", check=POSITIVE
+    )
+    margin: float = number(
+        1.3, "L of a repeated step, over the curvature found: the next need not be repeated too", check=POSITIVE
+    )
+    decay: float = number(
+        0.99, "factor on L after each step, so that steps grow again where the curvature allows it", check=PART
+    )
+    theta: float = number(
+        0.2, "where momentum begins: below 1, as steps are short for most directions of descent", check=PART
+    )
+    damping: float = number(
+        0.1, "Coulomb's law: 1 - the greatest momentum, at most; docs/notebook_ccp.md has trials", check=PART
+    )
+    near: float = number(
+        0.03, "the same at least, where the impulses have gone a way of little curvature", check=PART
+    )
+    growth: float = number(
+        6.0, "Coulomb's law: of a squared step over the least one, where momentum begins anew", check=POSITIVE
+    )
     single: float = number(
         3e-4,
         "natural residual above which single precision is enough, times the root of the number of contacts: rounding "
         "hides the curvature along a step, but the errors of many contacts cancel",
+        check=NOT_NEGATIVE,
     )
 
 
