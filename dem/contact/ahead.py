@@ -56,6 +56,7 @@ from dem.contact.spheres import frame_of, to_box
 from dem.geometry.vectors import cross, dot, plus, shares, turned
 
 #: Radii (half thicknesses) by which a body is moved ahead along another one, at most: its impulses may stop it sooner.
+#: How far a surface rolls, and how far what touches a flat body bends away from it, go on to the end of the step.
 FURTHEST = 0.25
 
 #: Half thicknesses of a guest by which a linear gap may overlap before the overlap at the start is looked up.
@@ -188,13 +189,17 @@ def turn_ahead(
         # The arms of the start; on flat faces both lead to one place.
         core = guest.center if here else after_turn(plus(arm, -1.0, arc), guest.spin, -h)
         seat = host.center if host.kind == SPHERE else after_turn(plus(other, -1.0, bow), host.spin, -h)
-        early = guest.moves or lasts
+        early, there = guest.moves or lasts, arm
         if early:
             arm = plus(core, 1.0, first_arc)
             seat = plus(arm, 1.0, apart) if flat else seat
         if host.moves:
             other = plus(seat, 1.0, first_bow)
         linear[c] = end - h * dot(n, plus(_velocity_at(host, other), -1.0, _velocity_at(guest, arm)))
+        if h < dt and guest.moves and given and flat and not here:
+            bent = dot(n, plus(plus(there, -1.0, arm), -h, cross(guest.spin, arm)))
+            if linear[c] + bent < DEEP * _thickness(guest.kind, size[a], inner):  # it touches at the start
+                linear[c] -= ((dt / h) ** 2 - 1.0) * bent
         if early and flat:
             seat = plus(seat, linear[c], n)
             other = seat if host.moves else other
@@ -346,10 +351,20 @@ def _swing(one, two, normal, early, h, dt):
         more = plus(more, 1.0, cross(w, plus(plus(their.core, 1.0, their.first), -1.0, their.arm)))
     more = plus(more, -1.0, cross(u, plus(plus(own.core, 1.0, own.first), -1.0, own.arm)))
     if guest.kind >= CONVEX:
-        more = plus(more, -0.5, cross(u, plus(own.arc, -1.0, own.first)))
+        more = plus(more, -0.5, cross(u, _rolled(own, dt / h)))
     if host.kind >= CONVEX:
-        more = plus(more, 0.5, cross(w, plus(their.arc, -1.0, their.first)))
+        more = plus(more, 0.5, cross(w, _rolled(their, dt / h)))
     return plus(more, -dot(more, normal), normal)
+
+
+@inlined
+def _rolled(arms, times):
+    """How far the end of an arc goes in a step, which is so many times as long as what is foreseen of it: at most as
+    far as the arc is long, unless it is foreseen to go further."""
+    way = plus(arms.arc, -1.0, arms.first)
+    far = times * np.sqrt(dot(way, way))
+    most = np.sqrt(dot(arms.arc, arms.arc))
+    return plus(_ZERO, times if far <= most else max(times * most / far, 1.0), way)
 
 
 @inlined

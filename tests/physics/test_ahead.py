@@ -8,13 +8,14 @@ from drive import RADIUS, G
 from mpi4py import MPI
 
 import pctt
+from dem import quaternion
 from dem.bodies import POLYHEDRON
 from dem.contact import find_contacts
 from dem.contact.narrow import CORNERS
 from dem.mesh import Mesh
 from dem.motion import Glide, Rotation
 from dem.scene import Scene
-from dem.shapes import Box, Capsule, Clump, Plane, Sphere
+from dem.shapes import Box, Capsule, Clump, Cylinder, Plane, Sphere
 from dem.start import new_world
 from dem.step import advanced
 from dem.step.system import ContactSystem
@@ -111,6 +112,34 @@ def test_no_gap_is_deeper_than_the_bodies_overlap():
     contacts = find_contacts(world, 0.01, unconstrained(world, 0.02))
     assert contacts.linear.min() < -0.003
     np.testing.assert_allclose(contacts.gap, 0.001, atol=1e-12)
+
+
+def test_a_rim_that_rolls_is_foreseen_to_the_end_of_the_step():
+    """A coin rolls on its rim, that goes further than a quarter of its half thickness: the linear gap leads to that of
+    the end, and the sliding has the arm of the middle of the step."""
+    radius, height, tilt, dt = 0.1, 0.002, 1.0, 1e-3
+    spin = 18.0 * np.array([-np.cos(tilt), 0.0, np.sin(tilt)])
+
+    def rim(turn):
+        """From the centre of a coin that has turned to the lowest point of its rim."""
+        axis = quaternion.rotate(quaternion.exponential(turn), np.array([np.sin(tilt), 0.0, np.cos(tilt)]))
+        across = axis[2] * axis - [0.0, 0.0, 1.0]
+        return radius * across / np.linalg.norm(across) - 0.5 * height * axis
+
+    first, last = rim(np.zeros(3)), rim(dt * spin)
+    scene = Scene(0.5)
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    turn = quaternion.exponential(np.array([0.0, tilt, 0.0]))
+    speed = -np.cross(spin, first)
+    place = [0.0, 0.0, -first[2]]
+    scene.add_grains(place, Cylinder(radius, height), DENSITY, quaternions=turn, velocity=speed, angular_velocity=spin)
+    world = new_world(scene, MPI.COMM_SELF)
+    contacts = find_contacts(world, 1e-4, unconstrained(world, dt))
+    nearest = np.argmin(contacts.gap)
+    bent = (last - first - dt * np.cross(spin, first))[2]
+    assert contacts.linear[nearest] == pytest.approx(bent, rel=0.02)
+    swing = 0.5 * np.cross(spin, last - first)[:2]  # the normal points down, from the coin to the floor
+    np.testing.assert_allclose(contacts.swing[nearest, :2], -swing, atol=0.02 * np.abs(swing).max())
 
 
 DOME = Sphere(1.0)

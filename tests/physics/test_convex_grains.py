@@ -46,7 +46,7 @@ def test_a_wobbling_coin_keeps_its_energy(radius, height, tilt):
     scene = on_floor("plane", 0.5)
     scene.add_grains(place, Cylinder(radius, height), 2000.0, quaternions=turn, angular_velocity=spin)
     first, last = energies(scene, 12 * np.sqrt(radius / G))
-    assert last == pytest.approx(first, rel=0.04)
+    assert last == pytest.approx(first, rel=0.004)
 
 
 @pytest.mark.parametrize(
