@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from dem.model.world import World
 
 HUGE = 50.0  #: lengths of the bed; in millimetres a mesh as long as a twentieth of it is longer
-HEAVY = 1e5  #: five times osmium [kg/m^3]
+HEAVY = 1e7  #: hundreds of times osmium: a body that is to be heavy beside others has less [kg/m^3]
 LIGHT = 10.0  #: less than foams have [kg/m^3]; solids have 0.5 to 22.6 g/cm^3
 STEPS = 100  #: without room for the first grain of a source
 
