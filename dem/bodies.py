@@ -112,11 +112,16 @@ def least_half_thickness(bodies: Bodies) -> Floats:
     return half_thickness(bodies.shape, bodies.size)
 
 
+@loop
 def half_thickness(kind: Ints, size: Floats) -> Floats:
     """Return the radius (n,) of the greatest sphere that fits into a shape of kind (n,) and size (n, 3), as of
     `dem.shapes.placed` [m]; of a mesh into the box about it."""
-    half = np.where(np.isin(kind, (BOX, MESH)), size.min(axis=1), size[:, 0])
-    return np.where(kind >= FORM, size[:, 2], half)
+    half = np.empty(len(kind))
+    for n in range(len(kind)):
+        half[n] = size[n, 2] if kind[n] >= FORM else size[n, 0]
+        if kind[n] == BOX or kind[n] == MESH:
+            half[n] = min(size[n, 0], size[n, 1], size[n, 2])
+    return half
 
 
 def turning(bodies: Bodies) -> Floats:

@@ -160,15 +160,6 @@ class Surface:
         row, entry = _entries(points, rows, cells.low, cells.width, cells.code, cells.start)
         return row, cells.triangle[entry]
 
-    def over(self, points: Floats, triangle: Ints) -> Floats:
-        """How far points (m, 3) are inside the three sides (m, 3) of triangles (m,), seen along the normals [m]."""
-        corner = self.corner[triangle]
-        sides = np.roll(corner, -1, axis=1) - corner
-        inward = cross(self.normal[triangle][:, None], sides)
-        size = length(inward)
-        inside = np.einsum("mki,mki->mk", points[:, None] - corner, inward)
-        return np.where(size > 0.0, inside / np.where(size > 0.0, size, 1.0), -np.inf)  # type: ignore[no-any-return]
-
     def _within(self, points: Floats, row: Ints, triangle: Ints, reach: Floats) -> Ints:
         """Which of triangles (m,) may be within reach (n,) [m] of points (n, 3), these rows (m,) of them, by the
         spheres about the triangles and then by their planes."""

@@ -137,19 +137,33 @@ class Flush(NamedTuple):
 
 def solids(kind: Ints, center: Floats, turn: Floats, size: Floats, hulls: Hulls, supports: Supports) -> Solids:
     """Those of rows (m,) of `dem.contact.primitives.Primitives`, with frames (m, 3, 3)."""
-    what, numbers, hull = np.zeros(len(kind), np.int64), np.zeros((len(kind), 6)), np.zeros(len(kind), np.int64)
-    scale, rounding = np.ones(len(kind)), np.where(np.isin(kind, (SPHERE, CAPSULE)), size[:, 0], 0.0)
-    numbers[:, :3], thick = size, half_thickness(kind, size)
-    what[kind == BOX] = BLOCK
-    other, rows = kind >= CONVEX, (kind >= POLYHEDRON) & (kind < CONVEX)
-    what[rows], hull[rows] = HULL, kind[rows] - POLYHEDRON + 1
-    scale[rows] = size[rows, 0] / hulls.radius[hull[rows]]
-    form = kind[other] - CONVEX
-    what[other], numbers[other] = supports.what[form], supports.numbers[form]
-    scale[other] = size[other, 0] / supports.radius[form]
-    rounding[other] = supports.rounding[form] * scale[other]
-    center, turn = np.ascontiguousarray(center), np.ascontiguousarray(turn)
-    return Solids(center, turn, scale, thick, what, numbers, hull, rounding, enclosing_radius(kind, size))
+    what, numbers, hull, scale, rounding = _numbers_of(kind, size, hulls.radius, supports[:])
+    place = np.ascontiguousarray(center), np.ascontiguousarray(turn), scale, half_thickness(kind, size)
+    return Solids(*place, what, numbers, hull, rounding, enclosing_radius(kind, size))
+
+
+@loop
+def _numbers_of(kind, size, hull_radius, supports):
+    """`what`, `numbers`, `hull`, `scale` and `rounding` of `Solids` of these kinds and sizes."""
+    whats, all_numbers, radius, least = supports
+    what, hull = np.zeros(len(kind), np.int64), np.zeros(len(kind), np.int64)
+    numbers, scale, rounding = np.zeros((len(kind), 6)), np.ones(len(kind)), np.zeros(len(kind))
+    for n in range(len(kind)):
+        k, form = kind[n], kind[n] - CONVEX
+        if form >= 0:
+            what[n], numbers[n], scale[n] = whats[form], all_numbers[form], size[n, 0] / radius[form]
+            rounding[n] = least[form] * scale[n]
+            continue
+        for i in range(3):
+            numbers[n, i] = size[n, i]
+        if k >= POLYHEDRON:
+            what[n], hull[n] = HULL, k - POLYHEDRON + 1
+            scale[n] = size[n, 0] / hull_radius[hull[n]]
+        elif k == BOX:
+            what[n] = BLOCK
+        elif k in (SPHERE, CAPSULE):
+            rounding[n] = size[n, 0]
+    return what, numbers, hull, scale, rounding
 
 
 def needles(start: Floats, end: Floats, thick: Floats) -> Solids:

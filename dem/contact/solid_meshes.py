@@ -12,13 +12,17 @@ from __future__ import annotations
 import numpy as np
 
 from dem.arrays import Bools, Floats, Ints
+from dem.compiled import loop
+from dem.contact.ahead import vector_of
 from dem.contact.convex import CLOSEST, Solids, needles, solids_planes, solids_solids
 from dem.contact.meshes import ROCKING, PlacedMesh, SurfaceContacts, each_once, within_cone
-from dem.contact.narrow import Manifold, Planes, dot
+from dem.contact.narrow import Manifold, Planes
+from dem.contact.narrow import dot as products
 from dem.contact.polyhedra import TIE, Hulls
 from dem.contact.simplex import ROUND, SNAP
+from dem.geometry.vectors import cross, dot, plus
 from dem.mesh import Surface, spread
-from dem.quaternion import cross, length
+from dem.quaternion import length
 
 #: Features of a solid on a surface: those of the surface for each name of a contact, and once more.
 NAMES = CLOSEST + 2
@@ -34,50 +38,78 @@ def solid_mesh(body: Solids, mesh: PlacedMesh, delta: Floats, hulls: Hulls) -> M
     over = _over_faces(row, triangle, body, delta, hulls, surface)
     ridges = _on_ridges(row, triangle, body, delta, hulls, surface)
     found = SurfaceContacts(*(np.concatenate(columns) for columns in zip(over, ridges)))
-    return found.take(_distinct(found, body, surface)).manifold(mesh)
+    order = np.lexsort((found.feature, found.gap, found.row))
+    kinds = len(surface.triangle), surface.features
+    distinct = _distinct(order, found[:2], found[2:], (body.thick, body.rounding), kinds)
+    return found.take(distinct).manifold(mesh)
 
 
 def _over_faces(
     row: Ints, triangle: Ints, body: Solids, delta: Floats, hulls: Hulls, surface: Surface
 ) -> SurfaceContacts:
     """Where corners and supports of shapes are over faces, or have gone through them from the side of the centre."""
-    normal, origin, center = surface.normal[triangle], surface.corner[triangle, 0], body.center[row]
-    outward = np.copysign(1.0, dot(center - origin, normal))[:, None] * normal
+    normal, origin = surface.normal[triangle], surface.corner[triangle, 0]
+    outward = np.copysign(1.0, products(body.center[row] - origin, normal))[:, None] * normal
     pair, name, touch = solids_planes(body.take(row), Planes(outward, origin), delta[row], hulls)
-    row, triangle, outward, center, gap = row[pair], triangle[pair], outward[pair], center[pair], touch.gap
-    foot = touch.point - 0.5 * gap[:, None] * outward
-    deep = np.flatnonzero(gap < 0.0)  # the way from the centre must go through the triangle
-    share = (height := dot((center - foot)[deep], outward[deep])) / (height - gap[deep])
-    way = foot.copy()
-    way[deep] = center[deep] + share[:, None] * (foot + gap[:, None] * outward - center)[deep]
-    found = SurfaceContacts(row, triangle + name * surface.features, foot, outward, gap)
-    return found.take(_within_sides(found, triangle, surface.over(way, triangle), body, hulls, surface))
+    if not len(pair):
+        return SurfaceContacts(pair, name, *touch)
+    faces, given = (surface.normal, surface.corner), (body.center, body.thick, body.rounding)
+    within, edged, foot = _within_sides(row, triangle, outward, (pair, *touch[::2]), given, faces, surface.beyond)
+    if len(edged):
+        n, k = edged.T
+        at = pair[n]
+        own, start, end = row[at], surface.corner[triangle[at], k], surface.corner[triangle[at], (k + 1) % 3]
+        inward = np.cross(surface.normal[triangle[at]], end - start)
+        further = np.maximum(SNAP * body.thick[own], -touch.gap[n])
+        side = Planes(-inward / length(inward)[:, None], start)
+        reaches = np.zeros(len(n), bool)
+        reaches[solids_planes(body.take(own), side, -further, hulls).pair] = True
+        within[n[~reaches]] = False
+    feature = triangle[pair] + name * surface.features
+    return SurfaceContacts(row[pair], feature, foot, outward[pair], touch.gap).take(within)
 
 
-def _within_sides(
-    found: SurfaceContacts, triangle: Ints, inside: Floats, body: Solids, hulls: Hulls, surface: Surface
-) -> Bools:
-    """Which of the places on triangles (k,), inside of their sides by `inside` (k, 3) [m], are contacts.
+@loop
+def _within_sides(row, triangle, outward, touch, body, faces, beyond):
+    """Which of the places (k,) over the planes of near triangles (m,) are contacts, inside of the sides of these; of
+    those that are only if the body reaches over a side the numbers of the place and of the side (sides, 2); and the
+    feet (k, 3) of all on the planes. What has gone through must be inside on the way from the centre.
 
     In a groove a body may have gone through both sides. What is behind a ridge, as seen from the body, is hidden.
     Beyond a ridge are corners of bodies that lie on it, further than they have gone through: without their skin they
     may be over the face, so that the ridge has no contact. What is deeper than the skin has one."""
-    row, outward = found.row, found.away
-    beyond, turn, back = (column[triangle] for column in surface.beyond)
-    thick, up = body.thick[row, None], turn * np.sign(dot(outward, surface.normal[triangle]))[:, None]
-    height = dot(body.center[row, None] - surface.corner[beyond, 0], surface.normal[beyond])
-    hidden = (up > 0.0) & (back * height <= 0.0)
-    within = inside >= -thick * np.select([hidden, up > 0.0], [-ROUND, ROUND], TIE)
-    shallow = (body.rounding[row, None] == 0.0) & (found.gap[:, None] >= -ROUND * thick)
-    edged = (up < 0.0) & shallow & ~within & (inside >= -2.0 * ROUND * thick)
-    n, k = np.nonzero(edged & (within | edged).all(axis=1)[:, None])
-    start, end = surface.corner[triangle[n], k], surface.corner[triangle[n], (k + 1) % 3]
-    inward = cross(surface.normal[triangle[n]], end - start)
-    side = Planes(-inward / length(inward)[:, None], start)
-    further = np.maximum(SNAP * body.thick[row[n]], -found.gap[n])
-    over = np.unique(solids_planes(body.take(row[n]), side, -further, hulls).pair)
-    within[n[over], k[over]] = True
-    return within.all(axis=1)  # type: ignore[no-any-return]
+    (pair, point, gap), (center, thicks, rounding), (normal, corner), (other, turn, back) = touch, body, faces, beyond
+    within, foot = np.empty(len(pair), np.bool_), np.empty(point.shape)
+    edged, count = np.empty((3 * len(pair), 2), np.int64), 0
+    for n in range(len(pair)):
+        own, t, up = row[pair[n]], triangle[pair[n]], vector_of(outward[pair[n]], 0)
+        thick, middle, face = thicks[own], vector_of(center[own], 0), vector_of(normal[t], 0)
+        at = plus(vector_of(point[n], 0), -0.5 * gap[n], up)
+        foot[n, 0], foot[n, 1], foot[n, 2] = at
+        if gap[n] < 0.0:
+            height = dot(plus(middle, -1.0, at), up)
+            at = plus(middle, height / (height - gap[n]), plus(plus(at, gap[n], up), -1.0, middle))
+        shallow = rounding[own] == 0.0 and gap[n] >= -ROUND * thick
+        within[n], first, sense = True, count, np.sign(dot(up, face))
+        for k in range(3):
+            start = vector_of(corner[t, k], 0)
+            inward = cross(face, plus(vector_of(corner[t, (k + 1) % 3], 0), -1.0, start))
+            size = np.sqrt(dot(inward, inward))
+            inside = dot(plus(at, -1.0, start), inward) / size if size > 0.0 else -np.inf
+            rises, slack, b = turn[t, k] * sense, TIE, other[t, k]
+            if rises > 0.0:
+                away = dot(plus(middle, -1.0, vector_of(corner[b, 0], 0)), vector_of(normal[b], 0))
+                slack = -ROUND if back[t, k] * away <= 0.0 else ROUND
+            if inside >= -thick * slack:
+                continue
+            if rises < 0.0 and shallow and inside >= -2.0 * ROUND * thick:
+                edged[count, 0], edged[count, 1] = n, k
+                count += 1
+            else:
+                within[n] = False
+        if not within[n]:
+            count = first
+    return within, edged[:count], foot
 
 
 def _on_ridges(
@@ -85,85 +117,124 @@ def _on_ridges(
 ) -> SurfaceContacts:
     """Where edges of the surface, with the vertices at their ends, are closest to shapes, among the surface around
     them."""
-    own, edge, start, end = _within_reach(*each_once(row, surface.side[triangle], surface.ridges), body, delta, surface)
-    rods = needles(start, end, body.thick[own])
-    pair, name, touch = solids_solids(body.take(own), rods, delta[own], hulls)
-    # Sharp bodies that lie on the edge have no point there that is closer than those of their faces.
-    lies = np.isin(pair, pair[name != CLOSEST]) & (body.rounding[own[pair]] == 0.0)
-    keep = (name != CLOSEST) | ~lies
-    own, edge, name, touch = own[pair[keep]], edge[pair[keep]], name[keep], touch.take(keep)
-    away, place = -touch.normal, touch.point + 0.5 * touch.gap[:, None] * touch.normal
-    found = SurfaceContacts(own, _feature_at(place, edge, SNAP * body.thick[own], surface), place, away, touch.gap)
-    least = within_cone(surface, found.feature, away, ROCKING)
+    own, edge = each_once(row, surface.side[triangle], surface.ridges)
+    near, start, end = _within_reach(own, edge, body.center, body.radius + delta, (surface.vertex, surface.edge))
+    own, edge = own[near], edge[near]
+    pair, name, touch = solids_solids(body.take(own), needles(start, end, body.thick[own]), delta[own], hulls)
+    if not len(pair):
+        return SurfaceContacts(pair, name, *touch)
+    given = (surface.vertex, surface.edge), len(surface.triangle)
+    keep, feature, place = _at_features((own, edge, pair, name), touch[:], body.thick, body.rounding, *given)
+    found = SurfaceContacts(own[pair], feature, place, -touch.normal, touch.gap).take(keep)
+    least = within_cone(surface, found.feature, found.away, ROCKING)
     least &= _beside(row, triangle, found, body.thick, surface)
-    return _named(found, name, least, body, surface)
+    return _named(found, name[keep], least, body, surface)
 
 
-def _within_reach(
-    row: Ints, edge: Ints, body: Solids, delta: Floats, surface: Surface
-) -> tuple[Ints, Ints, Floats, Floats]:
-    """Of bodies and edges those that come into reach of each other, and from where to where the edges do."""
-    one, two = np.moveaxis(surface.vertex[surface.edge[edge]], 1, 0)
-    size, away = length(two - one), body.center[row] - one
-    along = (two - one) / np.where(size > 0.0, size, 1.0)[:, None]
-    foot = dot(away, along)
-    half = np.sqrt(np.maximum((body.radius + delta)[row] ** 2 - (dot(away, away) - foot**2), 0.0))
-    low, high = np.maximum(foot - half, 0.0)[:, None], np.minimum(foot + half, size)[:, None]
-    near = (low < high)[:, 0]
-    return row[near], edge[near], (one + low * along)[near], (one + high * along)[near]
+@loop
+def _within_reach(row, edge, center, reach, edges):
+    """Which of edges (k,) come into reach (m,) of the bodies (m, 3) of these rows (k,), and from where to where these
+    do (n, 3)."""
+    vertex, ends = edges
+    near, start, end, count = np.empty(len(row), np.int64), np.empty((len(row), 3)), np.empty((len(row), 3)), 0
+    for n in range(len(row)):
+        one = vector_of(vertex[ends[edge[n], 0]], 0)
+        along = plus(vector_of(vertex[ends[edge[n], 1]], 0), -1.0, one)
+        away, size = plus(vector_of(center[row[n]], 0), -1.0, one), np.sqrt(dot(along, along))
+        if size == 0.0:
+            continue
+        foot = dot(away, along) / size
+        half = np.sqrt(max(reach[row[n]] ** 2 - (dot(away, away) - foot**2), 0.0))
+        low, high = max(foot - half, 0.0), min(foot + half, size)
+        if low < high:
+            near[count] = n
+            start[count, 0], start[count, 1], start[count, 2] = plus(one, low / size, along)
+            end[count, 0], end[count, 1], end[count, 2] = plus(one, high / size, along)
+            count += 1
+    return near[:count], start[:count], end[:count]
 
 
-def _feature_at(place: Floats, edge: Ints, close: Floats, surface: Surface) -> Ints:
-    """The features of places (k, 3) on edges (k,): these, or the vertices that are close (k,) [m]."""
-    first, count = len(surface.triangle), len(surface.edge)
-    feature = first + edge
-    for vertex in surface.edge[edge].T:
-        feature = np.where(length(place - surface.vertex[vertex]) < close, first + count + vertex, feature)
-    return feature  # type: ignore[no-any-return]
+@loop
+def _at_features(names, touch, thick, rounding, edges, faces):
+    """Of contacts (k,) of bodies and edges which stay; their features: the edges, or the vertices that are close; and
+    their places on these. Sharp bodies that lie on an edge have no point there that is closer than those of their
+    faces."""
+    (own, edge, pair, name), (point, normal, gap), (vertex, ends) = names, touch, edges
+    lies = np.zeros(len(own), np.bool_)
+    for n in range(len(pair)):
+        lies[pair[n]] |= name[n] != CLOSEST and rounding[own[pair[n]]] == 0.0
+    keep, feature, place = np.empty(len(pair), np.bool_), np.empty(len(pair), np.int64), np.empty(point.shape)
+    for n in range(len(pair)):
+        m = pair[n]
+        keep[n], feature[n] = name[n] != CLOSEST or not lies[m], faces + edge[m]
+        at = plus(vector_of(point[n], 0), 0.5 * gap[n], vector_of(normal[n], 0))
+        place[n, 0], place[n, 1], place[n, 2] = at
+        for k in range(2):
+            v = ends[edge[m], k]
+            way = plus(at, -1.0, vector_of(vertex[v], 0))
+            if np.sqrt(dot(way, way)) < SNAP * thick[own[m]]:
+                feature[n] = faces + len(ends) + v
+    return keep, feature, place
 
 
 def _named(found: SurfaceContacts, name: Ints, least: Bools, body: Solids, surface: Surface) -> SurfaceContacts:
     """Those that are the `least` (k,), with features that tell the names: of an edge several, of a vertex, at which
     several edges end, one, of sharp bodies with a face, if there is one."""
-    order = np.flatnonzero(least)
-    last = (name == CLOSEST) & (body.rounding[found.row] == 0.0)
-    order = order[np.lexsort((found.gap[order], last[order]))]
-    found, name = found.take(order), name[order]
-    named = found.feature + (1 + name) * surface.features
+    found, name = found.take(least), name[least]
     at_vertex = found.feature >= len(surface.triangle) + len(surface.edge)
+    name = np.where(at_vertex & (name != CLOSEST), 0, name)  # which edge is the closest there is a matter of rounding
+    named = found.feature + (1 + name) * surface.features
     each = found.row * (NAMES * surface.features) + np.where(at_vertex, found.feature, named)
-    _, first = np.unique(each, return_index=True)
-    return found._replace(feature=named).take(first)
+    order = np.lexsort((found.gap, (name == CLOSEST) & (body.rounding[found.row] == 0.0), each))
+    each = each[order]
+    first = np.ones(len(each), bool)
+    first[1:] = each[1:] != each[:-1]
+    return found._replace(feature=named).take(order[first])
 
 
 def _beside(row: Ints, triangle: Ints, found: SurfaceContacts, thick: Floats, surface: Surface) -> Bools:
     """Which contacts of edges and vertices are closest, too, among the near triangles (n,) of their rows that they lie
     in, though these do not have them: as where the corners of one meet the side of another."""
-    loose = np.flatnonzero(surface.loose[found.feature - len(surface.triangle)])
+    beside, loose = np.ones(len(found.row), bool), np.flatnonzero(surface.loose[found.feature - len(surface.triangle)])
+    if not len(loose):
+        return beside
     start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(thick)))])
     own, entry = spread(start, found.row[loose])
-    own, other = loose[own], triangle[np.argsort(row, kind="stable")[entry]]
+    own, other = loose[own], triangle[entry]
     meet = surface.closest(found.point[own], other).distance <= 1e-6 * thick[found.row[own]]
     own, other = own[meet], other[meet]
     way = surface.corner[other] - found.point[own, None]
-    ahead = dot(way, found.away[own, None]) > ROCKING * length(way) + 1e-6 * thick[found.row[own], None]
-    beside = np.ones(len(found.row), bool)
+    ahead = products(way, found.away[own, None]) > ROCKING * length(way) + 1e-6 * thick[found.row[own], None]
     beside[own[ahead.any(axis=1)]] = False
     return beside
 
 
-def _distinct(found: SurfaceContacts, body: Solids, surface: Surface) -> Ints:
-    """Which contacts are not within SNAP half thicknesses of one of lesser gap and almost the same direction, nor those
-    of a ridge beside a corner that is over a face: its direction is that of a corner without its skin."""
-    order = np.lexsort((found.feature, found.gap, found.row))
-    start = np.concatenate([[0], np.cumsum(np.bincount(found.row, minlength=len(body.thick)))])
-    one, two = spread(start, found.row[order])
-    one, two, before = order[one], order[two], two < one
-    thick = body.thick[found.row[one]]
-    apart, lower = length(found.point[one] - found.point[two]) / thick, (found.gap[two] - found.gap[one]) / thick
-    name, feature = np.divmod(found.feature, surface.features)
-    over = feature < len(surface.triangle)
-    bevel = ~over & (name == 1 + CLOSEST) & (body.rounding[found.row] == 0.0)
-    left_out = np.unique(one[bevel[one] & over[two] & (apart <= 2.0 * ROUND) & (lower <= ROUND)])
-    same = before & (apart <= SNAP) & (dot(found.away[one], found.away[two]) > 0.99) & ~np.isin(two, left_out)
-    return np.setdiff1d(order, np.concatenate([left_out, one[same]]))
+@loop
+def _distinct(order, names, touch, body, kinds):
+    """Which contacts, in this order of rows and gaps, are not within SNAP half thicknesses of one of lesser gap and
+    almost the same direction, nor those of a ridge beside a corner that is over a face: its direction is that of a
+    corner without its skin."""
+    (row, feature), (point, away, gap), (thicks, rounding), (faces, features) = names, touch, body, kinds
+    hidden, twice, first = np.zeros(len(order), np.bool_), np.zeros(len(order), np.bool_), 0
+    for a in range(len(order)):
+        one = order[a]
+        own, thick = row[one], thicks[row[one]]
+        first = first if row[order[first]] == own else a
+        if feature[one] % features < faces or feature[one] // features != 1 + CLOSEST or rounding[own] != 0.0:
+            continue
+        b = first
+        while b < len(order) and row[order[b]] == own:
+            two = order[b]
+            way = plus(vector_of(point[one], 0), -1.0, vector_of(point[two], 0))
+            beside = np.sqrt(dot(way, way)) <= 2.0 * ROUND * thick and gap[two] - gap[one] <= ROUND * thick
+            hidden[one] |= beside and feature[two] % features < faces
+            b += 1
+    for a in range(len(order)):
+        one = order[a]
+        first = first if a > 0 and row[order[first]] == row[one] else a
+        for b in range(first, a):
+            two = order[b]
+            way = plus(vector_of(point[one], 0), -1.0, vector_of(point[two], 0))
+            close = np.sqrt(dot(way, way)) <= SNAP * thicks[row[one]]
+            twice[one] |= close and not hidden[two] and dot(vector_of(away[one], 0), vector_of(away[two], 0)) > 0.99
+    return ~(hidden | twice)
