@@ -191,6 +191,14 @@ class Simulation:
             raise AttributeError(f"a Simulation has no {name!r} to set; {helps}{nearest(name, known)}")
         super().__setattr__(name, value)
 
+    def __getattr__(self, name: str) -> Any:
+        """AttributeError that says where the name is, if it is a setting, a figure of the last step or of the world."""
+        own: dict[str, Any] = {} if name.startswith("_") else vars(self)
+        found = [f"{place}.{name}" for place in ("settings", "world") if hasattr(own.get(place), name)]
+        found += [f"figures[{name!r}]"] if name in own.get("figures", ()) else []
+        where = f"; did you mean {found[0]}?" if found else nearest(name, [*filter(str.isalpha, dir(self))])
+        raise AttributeError(f"a Simulation has no attribute {name!r}{where}")
+
     @classmethod
     def load(cls, path: str | Path, scene: Scene | Experiment, *given: Any, **more: Any) -> Simulation:
         """The simulation that `save` kept, or a checkpoint.h5 of a run, with the same scene and time step; the other

@@ -61,13 +61,16 @@ def test_what_is_no_region_is_refused():
         measures.mixing(sim.sample, whole, block, (2, 2, 2))
 
 
-def test_an_attribute_that_a_simulation_does_not_have_is_not_set():
+def test_an_attribute_that_a_simulation_does_not_have_is_refused_with_what_it_has():
     sim = Simulation(falling())
     for name in ("dt", "gravity", "figurs"):
         with pytest.raises(AttributeError, match=f"a Simulation has no '{name}' to set; settings are arguments"):
             setattr(sim, name, 0.5)
     sim.figures = {}  # it has
     sim.step()
+    for name, found in {"dt": "settings.dt", "grains": "world.grains", "velocitys": "velocities"}.items():
+        with pytest.raises(AttributeError, match=f"a Simulation has no attribute '{name}'; did you mean {found}"):
+            getattr(sim, name)
     assert sim.copy().steps == 1
 
 
