@@ -82,6 +82,19 @@ def relative_velocities(frame, arm, body, w) -> Floats:
 
 
 @loop
+def greatest_velocities(frame, arm, body, w, first) -> Floats:
+    """The loop of `ContactMap.greatest_velocities`."""
+    most = np.zeros(len(body))
+    for c in range(len(body)):
+        if body[c, 1] >= first:
+            u0, u1, u2 = velocity_at(c, arm, body, w)
+            for k in range(3):
+                y = frame[c, 3 * k] * u0 + frame[c, 3 * k + 1] * u1 + frame[c, 3 * k + 2] * u2
+                most[c] = max(most[c], abs(y))
+    return most
+
+
+@loop
 def closing(frame, arm, body, w) -> tuple[Floats, Floats]:
     """D' w (nc, 3) for velocities w (rows, 6) of bodies, and what of it (nc,) is rounding: 1e-12 of the velocities of
     both bodies at their contact [m/s].

@@ -224,6 +224,11 @@ class ContactMap:
         """D' v (nc, 3) for the velocities (rows, 6) of all rows of a table of the halo, without a message."""
         return loops.relative_velocities(*self._arrays, v)
 
+    def greatest_velocities(self, v: Floats, first: int) -> Floats:
+        """The greatest component (nc,) of D' v of those contacts whose second body is in the row `first` or behind it,
+        0 of the others, without a message."""
+        return loops.greatest_velocities(*self._arrays, v, first)
+
     def works(self, g: Floats, v: Floats, new_v: Floats) -> tuple[float, float, Floats, Floats]:
         """The work of normal and of tangential impulses g (nc, 3) on the mean of two velocities (rows, 6) of all rows
         of a table of the halo, and the normal velocities (nc,) of both, without a message."""

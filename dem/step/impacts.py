@@ -73,7 +73,6 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     ball[grains:] = False
     if kinds_of(Constraint, world.named):
         ball[slots(world, table.id)[0]] = False
-    image = -world.cell.whole(table.position[contacts.b] - table.position[contacts.a])
     radius = np.ascontiguousarray(table.size[:, 0])
     surface, slow = np.zeros((0, 3)), np.zeros(len(contacts)) + dt * math.hypot(*world.gravity)
     closing = np.zeros(len(contacts))
@@ -88,11 +87,18 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
         contacts = _where_they_touch(world, contacts, touched, motion.prescribed, (ball, radius, slow))
     if pairs.bounces:
         surface = _surfaces(contacts, old)
-    kind, bounce, offset, marked, some = struck(
-        (contacts.a, contacts.b, contacts.normal, contacts.gap), contacts.linear_gap - dt * closing,
-        (ball, table.mass, radius, table.material), (table.position, old, surface),
-        (pairs.restitution, pairs.stiffness), grains, image, dt, slow,
-    )  # fmt: skip
+    bodies, laws = (ball, table.mass, radius, table.material), (pairs.restitution, pairs.stiffness)
+
+    def met(of: Contacts, closing: Floats, slow: Floats) -> tuple[Ints, Floats, Floats, Bools, bool]:
+        image, linear = -world.cell.whole(table.position[of.b] - table.position[of.a]), of.linear_gap - dt * closing
+        touching, motions = (of.a, of.b, of.normal, of.gap), (table.position, old, surface)
+        return struck(touching, linear, bodies, motions, laws, grains, image, dt, slow)  # type: ignore[no-any-return]
+
+    if not pairs.bounces:  # in a bed hardly any pair is near no other
+        alone = _alone(contacts.a, contacts.b, ball)
+        if not on_any(world.comm, met(contacts.take(alone), closing[alone], slow[alone])[4])[0]:
+            return contacts
+    kind, bounce, offset, marked, some = met(contacts, closing, slow)
     if not on_any(world.comm, some)[0]:
         return contacts
     rows = np.stack([contacts.a, contacts.b], axis=1)
@@ -125,6 +131,20 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
     return _with_impacts(contacts, chosen, [x[here] for x in found], late, of_grains, dt)
 
 
+@loop
+def _alone(a, b, ball):
+    """The contacts (k,) of balls of the rows a, b (nc,) that are near no other body."""
+    many, found, count = np.zeros(len(ball), np.int64), np.empty(len(a), np.int64), 0
+    for c in range(len(a)):
+        many[a[c]] += 1
+        many[b[c]] += 1
+    for c in range(len(a)):
+        if many[a[c]] == many[b[c]] == 1 and ball[a[c]] and ball[b[c]]:
+            found[count] = c
+            count += 1
+    return found[:count]
+
+
 def _surfaces(contacts: Contacts, velocity: Floats) -> Floats:
     """The velocities (nc, 3) of the second bodies in their contacts, where bodies have these (rows, 6)."""
     moved = 0.0 if contacts.moved is None else contacts.moved
@@ -139,7 +159,7 @@ def _where_they_touch(
     radii (rows,), that come to bodies of the `prescribed` velocities (large, 6), along the normal of the end, too,
     faster than the last of the three, `slow` (nc,). A ball that rolls from one face to the next does not."""
     (ball, radius, slow), table, near = balls, contacts.near.bodies, contacts.near
-    rows = np.flatnonzero(touched[:, :3].any(axis=1) & ball[contacts.a])
+    rows = _touched(touched, contacts.a, ball)
     if not len(rows) or contacts.moved is None:
         return contacts
     velocity = table.velocity.copy()
@@ -156,6 +176,17 @@ def _where_they_touch(
     comes = _surfaces(found.take(rows), velocity) - velocity[a, :3]
     linear[rows] = -time * np.einsum("ci,ci->c", n, comes)
     return replace(found, linear=linear)
+
+
+@loop
+def _touched(touched, a, ball):
+    """The contacts of balls in the rows a (nc,) that have a normal of the place of touch."""
+    found, count = np.empty(len(a), np.int64), 0
+    for c in range(len(a)):
+        if ball[a[c]] and (touched[c, 0] != 0.0 or touched[c, 1] != 0.0 or touched[c, 2] != 0.0):
+            found[count] = c
+            count += 1
+    return found[:count]
 
 
 def _with_impacts(

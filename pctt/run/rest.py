@@ -119,14 +119,15 @@ def energies_of_fall(
 def _passing(world: World, system: ContactSystem) -> Floats:
     """The greatest component (nc,) [m/s] of the velocity that tools, which are bodies of prescribed motion, belts and
     the flow of a cell have at each contact."""
-    at_contacts = [known for known in (system.surface, system.drift) if known is not None]
-    tools, most = system.free_large, np.zeros(len(system.contacts))
+    tools, first = system.free_large, len(system.near.bodies) - len(system.free_large)
     if world.large_moves:
         tools = np.where(bodies.is_dynamic(world.large)[:, None], 0.0, tools)
+    most = np.zeros(len(system.contacts))
     if tools.any():
         table = np.zeros(system.near.bodies.velocity.shape)
-        table[len(table) - len(tools) :] = tools
-        at_contacts.append(system.contact_map.relative_velocities(table))
-    for known in at_contacts:
-        most = np.maximum(most, np.abs(known).max(axis=1, initial=0.0))
+        table[first:] = tools
+        most = system.contact_map.greatest_velocities(table, first)
+    for known in (system.surface, system.drift):
+        if known is not None:
+            most = np.maximum(most, np.abs(known).max(axis=1, initial=0.0))
     return most
