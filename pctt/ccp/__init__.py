@@ -147,13 +147,14 @@ def solved(
     result = asked = _by(type, problem, start, limits, options, newton, law)
     other = "conic" if asked.solver == "apgd" else "apgd"
     wrong = asked.status is Status.BREAKDOWN and other == "conic"  # products are no numbers
-    # the law may have a solution where the convex problems of a sequence have none
-    doubtful = asked.status is Status.UNBOUNDED and asked.law == FIXED_POINT
+    # impulses that grow show that the relaxation has no solution; the law, which `apgd` follows, may have one
+    grown = asked.status is Status.UNBOUNDED and asked.iterations > 0
+    doubtful = grown and law == COULOMB and asked.solver != "apgd"
     hopeless = (asked.final and not doubtful) or asked.exhausted or wrong
     if limits.fallback and not hopeless:
         rest = dataclasses.replace(limits.after(asked.iterations), max_it=-1)
         second = _by(other, problem, start if doubtful else asked.impulse, rest, None, newton, law)
-        better = second.final or doubtful or second.residual < asked.residual
+        better = second.final or (asked.law == FIXED_POINT if doubtful else second.residual < asked.residual)
         result = second.after(asked) if better else dataclasses.replace(asked).after(second)
         result.asked, result.reason = asked, f"{type}: {asked.reason}; {other}: {second.reason}"
     return result
