@@ -36,6 +36,8 @@ FASTER = "for sparse matrices try pctt.pc.BlockICC"
 UNHARMED = {"cg", "cgne", "fcg", "fgmres", "fbcgs", "fbcgsr", "gcr", "pipefcg", "pipefgmres"}
 #: Methods that compute the residual of x anew. If they are part of another preconditioner, that must be linear.
 REFINING = {"richardson", "chebyshev"}
+#: Methods for matrices of any sign, whose preconditioner must be positive: of a negative matrix they get minus its own.
+ABSOLUTE = {"minres", "symmlq"}
 #: Reasons for the end of a Krylov method whose preconditioner is not positive definite.
 SPOILT = {
     getattr(PETSc.KSP.ConvergedReason, f"DIVERGED_{name}")
@@ -61,6 +63,7 @@ class TensorTrain(Context):
         self.P: PETSc.Mat | None = None  # the matrix, or a copy of it in AIJ; None if it has no rows
         self.rank = 1
         self.sign = 1.0  # -1: the train is that of minus the matrix
+        self._turned = False  # whether the solve that is going on gets minus the preconditioner
         self.failed = False  # whether there is no preconditioner, by -pc_tt_fallback none
         self.places = Places()
         self._structure: tuple | None = None
@@ -236,6 +239,8 @@ class TensorTrain(Context):
             with PETSc.Log.Event("TTApply"):
                 y.array_w[:] = self.sign * self.made.times(x.array_r)
                 PETSc.Log.logFlops(self.made.flops)
+        if self._turned:
+            y.scale(-1.0)
 
     def matApply(self, pc: PETSc.PC, X: PETSc.Mat, Y: PETSc.Mat) -> None:
         """Y = M X for dense Mats; block Jacobi and trains of sparse matrices take one column after the other."""
@@ -266,6 +271,7 @@ class TensorTrain(Context):
         if self.P is not None and self.rank > 1:
             self._last_precision = self._precision(self._is_unharmed(ksp))
             self.made.use(self._last_precision)
+        self._turned = ksp.getType() in ABSOLUTE and self.P is not None and has_negative_diagonal(self.P)
         cost_estimate = None if self.P is None or self.failed else self.made.cost_estimate
         self._watch = None
         if cost_estimate is not None and Watch.can(ksp, pc):
@@ -287,6 +293,7 @@ class TensorTrain(Context):
 
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Solve again where a train has spoilt the method, and count what the solve used."""
+        self._turned = False
         if self.P is None or self.failed:
             return
         if self.rank > 1:  # whoever calls next may be another method
