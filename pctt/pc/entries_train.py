@@ -62,6 +62,11 @@ class EntriesTrain:
         self.failure = self.note = ""
 
     @property
+    def order(self) -> str:
+        """The order of the rows."""
+        return self._layout.order if self._layout else "natural"
+
+    @property
     def idle(self) -> dict[str, str]:
         """Options that have no effect, and why."""
         none: dict[str, str] = {}

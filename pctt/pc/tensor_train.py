@@ -30,6 +30,8 @@ NOWHERE = (
     "nothing is known of the places of its rows (no grid, coordinates, DM or near null space), so they are in reverse "
     "Cuthill-McKee order"
 )
+#: The orders of rows but for that of a grid, which is named by where it is known from.
+ORDERS = {"morton": "a space-filling curve", "rcm": "reverse Cuthill-McKee", "natural": "their numbers"}
 FASTER = "for sparse matrices try pctt.pc.BlockICC"
 #: Krylov methods that are as accurate if the preconditioner rounds to single precision: they multiply by A each vector
 #: that they add to x. Others take a product M A p for the preconditioner of a vector that they never formed.
@@ -166,7 +168,7 @@ class TensorTrain(Context):
             return
         made = getattr(self, "made", None)
         if not isinstance(made, SparseTrain) or made.options != self.options:
-            made = self.sparse_train(self.comm, self.options, self.account)
+            made = self.sparse_train(self.comm, self.options, self.account, self.prefix)
         self.made = made
         made.begin(P, self.places)
 
@@ -365,7 +367,7 @@ class TensorTrain(Context):
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer | None = None) -> None:
         if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII:
-            lines = ["no matrix with rows"] if self.P is None else self.report()
+            lines = ["made for no matrix with rows yet"] if self.P is None else self.report()
             for line in pc.comm.tompi4py().bcast(lines):
                 viewer.printfASCII(f"  {line}\n")
 
@@ -376,7 +378,7 @@ class TensorTrain(Context):
             f"tensor train: {self._line()}",
             f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, kept {a.kept} times, "
             f"trees made anew {a.resets}",
-            f"rows ordered by {self.places.source}",
+            *([f"rows ordered by {ORDERS.get(self.made.order, self.places.source)}"] if self.rank > 1 else []),
             *([] if symmetric else [NOT_SYMMETRIC]),
             *(f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()),
             *(["the next matrix is tried again"] if a.fallbacks else []),
