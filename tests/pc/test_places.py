@@ -90,7 +90,6 @@ def test_where_nothing_is_known_a_warning_says_so(recwarn, monkeypatch):
 @pytest.mark.parametrize(
     ("order", "words"),
     [
-        ("auto", "ordered by reverse Cuthill-McKee"),
         ("natural", "ordered by their numbers"),
         ("grid", "-a_pc_tt_order grid: .*allowed without are auto, rcm, natural"),
     ],
