@@ -195,7 +195,9 @@ def _by(
     run = method.function
     try:
         with phase("CCPSolve"):
-            found = run(problem, guess, limits, *given, coulomb=True) if coulomb and method.has_law else None
+            found = _enough(problem, guess, limits, coulomb) if method.needs == NEWTON else None
+            if found is None and coulomb and method.has_law:
+                found = run(problem, guess, limits, *given, coulomb=True)
             # conic's own systems of Coulomb's law are those of bodies, or of few contacts
             if coulomb and (found is None or (found.status is Status.GIVEN_UP and problem.contact_map is None)):
                 result = fixed_point(lambda *convex: run(*convex, *given), problem, guess, limits)
@@ -221,6 +223,18 @@ def _by(
     if result.converged and (squeezed := limits.squeezed(accuracy, coulomb)):
         result.status, result.reason = Status.SQUEEZED, squeezed
     return result
+
+
+def _enough(problem: ConeProblem, guess: Array, limits: Limits, coulomb: bool) -> Result | None:
+    """A guess that meets the limits already, as the result of a method whose path would leave it; else None."""
+    if problem.norm(guess) == 0.0:
+        return None
+    g = problem.cones.project(guess, np.empty_like(guess))
+    residual = limits.residual(problem.errors(g, problem.product(g) + problem.r, coulomb))
+    if not residual <= limits.aimed:
+        return None
+    limits.report(0, residual)
+    return Result(g, Status.CONVERGED, limits.met, residual, 0, history=[residual])
 
 
 def _measure(problem: ConeProblem, result: Result) -> Accuracy:
