@@ -147,13 +147,14 @@ def solved(
     result = asked = _by(type, problem, start, limits, options, newton, law)
     other = "conic" if asked.solver == "apgd" else "apgd"
     wrong = asked.status is Status.BREAKDOWN and other == "conic"  # products are no numbers
-    # the law may have a solution where the convex problems of a sequence have none
-    doubtful = asked.status is Status.UNBOUNDED and asked.law == FIXED_POINT
+    # impulses that grow show that the relaxation has no solution; the law, which `apgd` follows, may have one
+    grown = asked.status is Status.UNBOUNDED and asked.iterations > 0
+    doubtful = grown and law == COULOMB and asked.solver != "apgd"
     hopeless = (asked.final and not doubtful) or asked.exhausted or wrong
     if limits.fallback and not hopeless:
         rest = dataclasses.replace(limits.after(asked.iterations), max_it=-1)
         second = _by(other, problem, start if doubtful else asked.impulse, rest, None, newton, law)
-        better = second.final or doubtful or second.residual < asked.residual
+        better = second.final or (asked.law == FIXED_POINT if doubtful else second.residual < asked.residual)
         result = second.after(asked) if better else dataclasses.replace(asked).after(second)
         result.asked, result.reason = asked, f"{type}: {asked.reason}; {other}: {second.reason}"
     return result
@@ -194,7 +195,9 @@ def _by(
     run = method.function
     try:
         with phase("CCPSolve"):
-            found = run(problem, guess, limits, *given, coulomb=True) if coulomb and method.has_law else None
+            found = _enough(problem, guess, limits, coulomb) if method.needs == NEWTON else None
+            if found is None and coulomb and method.has_law:
+                found = run(problem, guess, limits, *given, coulomb=True)
             # conic's own systems of Coulomb's law are those of bodies, or of few contacts
             if coulomb and (found is None or (found.status is Status.GIVEN_UP and problem.contact_map is None)):
                 result = fixed_point(lambda *convex: run(*convex, *given), problem, guess, limits)
@@ -220,6 +223,18 @@ def _by(
     if result.converged and (squeezed := limits.squeezed(accuracy, coulomb)):
         result.status, result.reason = Status.SQUEEZED, squeezed
     return result
+
+
+def _enough(problem: ConeProblem, guess: Array, limits: Limits, coulomb: bool) -> Result | None:
+    """A guess that meets the limits already, as the result of a method whose path would leave it; else None."""
+    if problem.norm(guess) == 0.0:
+        return None
+    g = problem.cones.project(guess, np.empty_like(guess))
+    residual = limits.residual(problem.errors(g, problem.product(g) + problem.r, coulomb))
+    if not residual <= limits.aimed:
+        return None
+    limits.report(0, residual)
+    return Result(g, Status.CONVERGED, limits.met, residual, 0, history=[residual])
 
 
 def _measure(problem: ConeProblem, result: Result) -> Accuracy:

@@ -78,13 +78,14 @@ def solve(
         else:
             basin = max(limits.tol, options.basin)
             second = tried.conic(guess, conic.Conic(), 0.0 if small else basin)
-            failed = small and second.status is not Status.GIVEN_UP and second.residual > basin
+            grown = second.status is Status.UNBOUNDED  # its path has left those of the law, which may have a solution
+            failed = small and not grown and second.status is not Status.GIVEN_UP and second.residual > basin
             if failed and problem.norm(guess) > 0.0:  # a guess at the wall of its cones
                 second = tried.conic(np.zeros_like(guess), conic.Conic())
             if failed and second.residual > basin:
                 tried.in_turns(options, basin)
-            elif not (small and second.final):
-                tried.apgd(second.impulse if second.iterations else first.impulse, limits.max_it)
+            elif grown or not (small and second.final):
+                tried.apgd(second.impulse if second.iterations and not grown else first.impulse, limits.max_it)
     return tried.result()
 
 

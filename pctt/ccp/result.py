@@ -130,7 +130,7 @@ class Status(Enum):
     SQUEEZED = "squeezed"  #: the natural residual is far below the tolerance, the closing work is not
     ITERATION_LIMIT = "iteration limit"
     STALLED = "stalled"  #: no progress, or steps too short
-    UNBOUNDED = "unbounded"  #: the problem has no solution
+    UNBOUNDED = "unbounded"  #: the cone problem has no solution, and none of the law was found
     BREAKDOWN = "breakdown"  #: something is no number
     GIVEN_UP = "given up"  #: the method does not apply
 

@@ -242,7 +242,8 @@ def chosen_order(order: str, places: Places, name: str, stored: bool = False, ke
     if order == "auto":
         return next(one for one, there in known.items() if there)
     if not known[order]:
-        raise ValueError(f"{name} {order}: {LACKS[order]}; allowed without is auto or natural")
+        allowed = ", ".join(["auto", *(one for one, there in known.items() if there)])
+        raise ValueError(f"{name} {order}: {LACKS[order]}; allowed without are {allowed}")
     return order
 
 

@@ -62,9 +62,18 @@ class EntriesTrain:
         self.failure = self.note = ""
 
     @property
+    def order(self) -> str:
+        """The order of the rows."""
+        return self._layout.order if self._layout else "natural"
+
+    @property
     def idle(self) -> dict[str, str]:
         """Options that have no effect, and why."""
-        none = dict.fromkeys(("eps", "order", "setup_limit"), "there is no train of rank 1") if self.rank == 1 else {}
+        none: dict[str, str] = {}
+        if self.rank == 1:
+            none = dict.fromkeys(("eps", "order", "setup_limit"), "there is no train of rank 1")
+        elif not self._tried:
+            none = dict.fromkeys(("eps", "setup_limit"), "auto tries no train, as none would pay")
         return {"variant": "it is for sparse matrices", **none}
 
     def make(self, A: PETSc.Mat, P: PETSc.Mat) -> bool:
@@ -82,6 +91,7 @@ class EntriesTrain:
         """
         self.failure, self.note, self.transform, self.cost_estimate = "", "", None, None
         self._iterations = 50  # if there is no estimate
+        self._tried = self._chosen = False  # whether a train was tried, and the base was chosen
         if self.rank == 1:
             return False
         options = self.options
@@ -95,9 +105,11 @@ class EntriesTrain:
             cost = self._iterations * product
             limit = options.part * cost if options.automatic else options.pays + cost
         if options.automatic and limit < options.pays:
-            if self.transform is None:
+            found = self._take_no_train(A, P, layout, "")
+            if not found:
                 self.note = f"conjugate gradients take about {self._iterations} iterations, so a train does not pay"
-            return self._take_no_train(A, P, layout, "")
+            return found
+        self._tried = True
         refused = self._make_train(P, layout, options.setup_limit or limit)
         if refused:
             return self._take_no_train(A, P, layout, refused)
@@ -107,6 +119,7 @@ class EntriesTrain:
 
     def _choose_base(self, A: PETSc.Mat, P: PETSc.Mat, layout: Layout) -> float:
         """Choose what is used where no train is; the operations of a solution with it."""
+        self._chosen = True
         self.transform = found = DifferencesInverse.best_of(P, layout)
         lattice = self._places.lattice(P.getSize()[0] // P.getBlockSize())
         product = _product_operations(P, lattice if found is None else layout.digits.shape)
@@ -129,8 +142,8 @@ class EntriesTrain:
         elif why:
             self.account.fall_back(why)
             self.failure = why
-            if not self.options.automatic:
-                self._choose_base(A, P, layout)
+        if not self._chosen:
+            self._choose_base(A, P, layout)
         return self.transform is not None
 
     def _make_train(self, P: PETSc.Mat, layout: Layout, limit: float) -> str:

@@ -37,6 +37,7 @@ class SparseTrain:
     """`make` makes a train for a matrix, `times` multiplies with it.
 
     inverse, compression : the inverse in use, and the newest train of a matrix; None before `make`, and after a failure
+    order : of the rows
     slots, hierarchy : slots and block pairs of the present structure; None before a train is made for it
     tree : slots that are kept from structure to structure
     rank : cap of the ranks
@@ -48,8 +49,9 @@ class SparseTrain:
     single_pays = False
     _product: TrainProduct  # of the inverse in use
 
-    def __init__(self, comm: MPI.Comm, options: Options, account: Account) -> None:
+    def __init__(self, comm: MPI.Comm, options: Options, account: Account, prefix: str) -> None:
         self.comm, self.options, self.account = comm, options, account
+        self._named = f"-{prefix}pc_tt_"  # how the names of the options begin
         self.rank = 1 if options.automatic else int(options.rank)
         self._block = 0  # block size of the last structure
         self.symmetric, self.failure = True, ""
@@ -60,7 +62,7 @@ class SparseTrain:
     def idle(self) -> dict[str, str]:
         """Options that have no effect, and why."""
         if self.rank == 1:
-            why = "a sparse matrix has no train unless -pc_tt_rank asks for one"
+            why = f"a sparse matrix has no train unless {self._named}rank asks for one"
             return dict.fromkeys(("eps", "variant", "order", "setup_limit"), why)
         return {"setup_limit": "it is for matrices given by their entries"}
 
@@ -78,7 +80,8 @@ class SparseTrain:
 
     def begin(self, P: PETSc.Mat, places: Places) -> None:
         """Begin a new structure; ValueError on all ranks if it lacks what the order needs."""
-        chosen_order(self.options.order, places, "-pc_tt_order", stored=True)
+        keyed = P.getAttr("key") is not None
+        self.order = chosen_order(self.options.order, places, f"{self._named}order", stored=True, keyed=keyed)
         self.places, self.failure = places, ""
         self._pause = self._waits = 0
         self._forget_structure()
@@ -125,7 +128,7 @@ class SparseTrain:
             self.account.resets += 1
             self._forget_trains()
         if self.tree is None:
-            self.tree = Slots(P, self.places, LEAF, self.options.order)
+            self.tree = Slots(P, self.places, LEAF, self.order)
         slots = SlottedMatrix(P, self.tree, self.comm, self.options.scaled)
         self._product = slots.product()
         return slots

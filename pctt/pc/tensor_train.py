@@ -30,12 +30,16 @@ NOWHERE = (
     "nothing is known of the places of its rows (no grid, coordinates, DM or near null space), so they are in reverse "
     "Cuthill-McKee order"
 )
+#: The orders of rows but for that of a grid, which is named by where it is known from.
+ORDERS = {"morton": "a space-filling curve", "rcm": "reverse Cuthill-McKee", "natural": "their numbers"}
 FASTER = "for sparse matrices try pctt.pc.BlockICC"
 #: Krylov methods that are as accurate if the preconditioner rounds to single precision: they multiply by A each vector
 #: that they add to x. Others take a product M A p for the preconditioner of a vector that they never formed.
 UNHARMED = {"cg", "cgne", "fcg", "fgmres", "fbcgs", "fbcgsr", "gcr", "pipefcg", "pipefgmres"}
 #: Methods that compute the residual of x anew. If they are part of another preconditioner, that must be linear.
 REFINING = {"richardson", "chebyshev"}
+#: Methods for matrices of any sign, whose preconditioner must be positive: of a negative matrix they get minus its own.
+ABSOLUTE = {"minres", "symmlq"}
 #: Reasons for the end of a Krylov method whose preconditioner is not positive definite.
 SPOILT = {
     getattr(PETSc.KSP.ConvergedReason, f"DIVERGED_{name}")
@@ -61,6 +65,7 @@ class TensorTrain(Context):
         self.P: PETSc.Mat | None = None  # the matrix, or a copy of it in AIJ; None if it has no rows
         self.rank = 1
         self.sign = 1.0  # -1: the train is that of minus the matrix
+        self._turned = False  # whether the solve that is going on gets minus the preconditioner
         self.failed = False  # whether there is no preconditioner, by -pc_tt_fallback none
         self.places = Places()
         self._structure: tuple | None = None
@@ -163,7 +168,7 @@ class TensorTrain(Context):
             return
         made = getattr(self, "made", None)
         if not isinstance(made, SparseTrain) or made.options != self.options:
-            made = self.sparse_train(self.comm, self.options, self.account)
+            made = self.sparse_train(self.comm, self.options, self.account, self.prefix)
         self.made = made
         made.begin(P, self.places)
 
@@ -236,6 +241,8 @@ class TensorTrain(Context):
             with PETSc.Log.Event("TTApply"):
                 y.array_w[:] = self.sign * self.made.times(x.array_r)
                 PETSc.Log.logFlops(self.made.flops)
+        if self._turned:
+            y.scale(-1.0)
 
     def matApply(self, pc: PETSc.PC, X: PETSc.Mat, Y: PETSc.Mat) -> None:
         """Y = M X for dense Mats; block Jacobi and trains of sparse matrices take one column after the other."""
@@ -266,6 +273,7 @@ class TensorTrain(Context):
         if self.P is not None and self.rank > 1:
             self._last_precision = self._precision(self._is_unharmed(ksp))
             self.made.use(self._last_precision)
+        self._turned = ksp.getType() in ABSOLUTE and self.P is not None and has_negative_diagonal(self.P)
         cost_estimate = None if self.P is None or self.failed else self.made.cost_estimate
         self._watch = None
         if cost_estimate is not None and Watch.can(ksp, pc):
@@ -287,6 +295,7 @@ class TensorTrain(Context):
 
     def postSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Solve again where a train has spoilt the method, and count what the solve used."""
+        self._turned = False
         if self.P is None or self.failed:
             return
         if self.rank > 1:  # whoever calls next may be another method
@@ -358,7 +367,7 @@ class TensorTrain(Context):
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer | None = None) -> None:
         if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII:
-            lines = ["no matrix with rows"] if self.P is None else self.report()
+            lines = ["made for no matrix with rows yet"] if self.P is None else self.report()
             for line in pc.comm.tompi4py().bcast(lines):
                 viewer.printfASCII(f"  {line}\n")
 
@@ -369,7 +378,7 @@ class TensorTrain(Context):
             f"tensor train: {self._line()}",
             f"set-ups {a.setups} ({a.setup_s:.3g} s), warm starts {a.reused}, kept {a.kept} times, "
             f"trees made anew {a.resets}",
-            f"rows ordered by {self.places.source}",
+            *([f"rows ordered by {ORDERS.get(self.made.order, self.places.source)}"] if self.rank > 1 else []),
             *([] if symmetric else [NOT_SYMMETRIC]),
             *(f"fell back: {why} ({count} times)" for why, count in a.fallbacks.items()),
             *(["the next matrix is tried again"] if a.fallbacks else []),

@@ -181,6 +181,22 @@ def test_where_the_relaxation_has_no_solution_and_coulombs_law_has_one(solver):
     assert relaxed.status is Status.UNBOUNDED
 
 
+@pytest.mark.parametrize("solver", ["conic", "auto"])
+def test_impulses_that_grow_by_newtons_method_say_nothing_of_coulombs_law(solver):
+    """Of contacts that are drawn with their impulses and velocities, many more than the unknowns."""
+    rng = np.random.default_rng(43)
+    slip, normal, state = rng.standard_normal((8, 2)), rng.random((2, 8)), np.arange(8) % 3  # open, slides, sticks
+    G, slip = rng.standard_normal((24, 5)), slip / np.hypot(*slip.T)[:, None]
+    g, y = np.zeros((2, 8, 3))
+    g[:, 0], y[:, 0] = (state > 0) * normal[0], (state == 0) * normal[0]
+    g[:, 1:] = -0.5 * (g[:, 0] * np.where(state == 2, normal[1], 1.0))[:, None] * slip
+    y[:, 1:] = (state < 2)[:, None] * slip
+    problem = ccp.ConeProblem(SELF, y - (G @ G.T @ g.ravel()).reshape(-1, 3), np.full(8, 0.5), N=G @ G.T)
+    result = ccp.solve(problem, type=solver, limits=Limits(1e-8))
+    assert result.converged, result.reason
+    assert result.accuracy.coulomb_residual <= 1e-8
+
+
 @pytest.mark.parametrize("solver", ["kucera", "spectral", "pdip"])
 def test_a_wedge_that_holds_by_friction_has_no_solution_by_either_way_to_coulombs_law(solver):
     """The sequence of cone problems and the method that is asked after it agree."""

@@ -204,10 +204,14 @@ def test_a_limit_stops_the_set_up_and_says_so():
 
 
 @pytest.mark.parallel(1, 2)
-def test_auto_takes_no_train_that_does_not_pay():
-    ksp = preconditioner(weighted)
+@pytest.mark.parametrize("entries", [weighted, covariance])
+def test_auto_takes_no_train_that_does_not_pay(entries):
+    ksp = preconditioner(entries)
     assert made(ksp).inverse is None
     assert "no train" in report(ksp)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on the first rank: the option has no effect
+        assert np.array_equal(operator(preconditioner(entries, eps=1e-5)), operator(ksp))
 
 
 def test_unsymmetric_and_indefinite_entries_get_no_transform():

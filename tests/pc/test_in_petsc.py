@@ -229,6 +229,7 @@ def test_options_without_an_effect_are_named(options, idle):
     [
         ({"variant": "paper", "rank": 20}, "-pc_tt_variant has no effect: it is for sparse matrices"),
         ({"eps": 1e-3, "rank": 1}, "-pc_tt_eps has no effect: there is no train of rank 1"),
+        ({"eps": 1e-3}, "-pc_tt_eps has no effect: auto tries no train"),
     ],
 )
 def test_options_without_an_effect_on_entries_are_named(options, words):

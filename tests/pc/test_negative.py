@@ -26,6 +26,9 @@ def test_minus_a_stored_matrix_has_minus_its_preconditioner(rank):
     again, residual = solve(ksp)
     assert again == its
     assert residual < 1e-6
+    ksp.setType("minres")  # its preconditioner must be positive
+    assert solve(ksp)[0] <= its
+    ksp.setType("cg")
     mat.scale(-1.0)  # with the same solver
     assert solve(ksp)[0] == its
 

@@ -7,10 +7,11 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.spatial import Delaunay
-from train_solver import context, solve, solver
+from train_solver import context, report, solve, solver
 
 from pctt.mat.order import places_of
 from pctt.pc.sparse_train import SparseTrain
+from pctt.petsc import own_errors
 
 N = 24
 
@@ -84,6 +85,23 @@ def test_where_nothing_is_known_a_warning_says_so(recwarn, monkeypatch):
     words = [str(one.message) for one in recwarn if "it was refused" in str(one.message)]
     assert len(words) == (MPI.COMM_WORLD.rank == 0)
     assert all("nothing is known of the places of its rows" in line for line in words)
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        ("natural", "ordered by their numbers"),
+        ("grid", "-a_pc_tt_order grid: .*allowed without are auto, rcm, natural"),
+    ],
+)
+def test_the_order_is_told_or_refused_by_its_name(order, words):
+    ksp = solver(without_dm(laplacian(plane())), prefix="a_", rank=20, order=order)
+    if order == "grid":
+        with pytest.raises(ValueError, match=words), own_errors():
+            ksp.setUp()
+    else:
+        ksp.setUp()
+        assert words in report(ksp)
 
 
 @pytest.mark.parallel(1, 3)

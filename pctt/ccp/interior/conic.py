@@ -87,14 +87,13 @@ def solve(
         history.append(limits.residual(found.errors))
         limits.report(len(history) - 1, history[-1])
         large = problem.norm(found.g) > LARGE * problem.norm(problem.r) / problem.mean_diagonal
-        unbounded = large and bool(why_unbounded(given, found.g, found.y))
+        unbounded = why_unbounded(given, found.g, found.y) if large else ""
         if unbounded or history[-1] == min(history):
             best = found.g
         progress = found.errors.natural <= LESS * least or gap <= HALF * last_gap
         waited = 0 if progress else waited + 1
         least, last_gap = min(found.errors.natural, least), gap
-        done = history[-1] <= limits.aimed or unbounded
-        if done or len(history) > limits.max_it or waited > options.patience:
+        if history[-1] <= limits.aimed or unbounded or len(history) > limits.max_it or waited > options.patience:
             break
         # scaling
         linear = conic.linearised(at, found)
@@ -119,7 +118,9 @@ def solve(
             at, recent = conic.moved(at, direction, step), (affine.x, direction.x)
     iterations = len(history) - 1
     status, words = Status.STALLED, f"stalled after {iterations} iterations"
-    if min(history) <= limits.tol:
+    if unbounded:
+        status, words = Status.UNBOUNDED, unbounded
+    elif min(history) <= limits.tol:
         status, words = Status.CONVERGED, limits.met
     elif iterations == limits.max_it:
         status, words = Status.ITERATION_LIMIT, f"{iterations} iterations"
