@@ -96,19 +96,19 @@ def test_a_heap_loses_energy_and_comes_to_rest(count):
 def test_ranks_and_restarts_agree(tmp_path):
     given = {"dt": DT, "tol": 1e-8, "closing_work": np.inf, "solver": "apgd", "stiffness": 1e6}
     with pctt.Simulation(heap(27, speed=1.0), comm=MPI.COMM_WORLD, **given) as sim:
-        sim.run(steps=12)
+        sim.run(steps=9)
         sim.save(tmp_path / "middle.h5")
-        sim.run(steps=12)
+        sim.run(steps=9)
         place, turn, force, key = sim.positions, sim.orientations, sim.contacts.force, sim.last.contacts.key
         assert len(force) > 10
     with pctt.Simulation.load(tmp_path / "middle.h5", heap(27, speed=1.0), comm=MPI.COMM_WORLD, **given) as again:
-        again.run(steps=12)
+        again.run(steps=9)
         np.testing.assert_array_equal(again.positions, place)
         np.testing.assert_array_equal(again.orientations, turn)
         np.testing.assert_array_equal(again.contacts.force, force)
         np.testing.assert_array_equal(again.last.contacts.key, key)
     with pctt.Simulation(heap(27, speed=1.0), comm=MPI.COMM_SELF, **given) as alone:
-        alone.run(steps=24)
+        alone.run(steps=18)
         np.testing.assert_allclose(alone.positions, place, atol=1e-5)
 
 

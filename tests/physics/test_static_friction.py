@@ -126,14 +126,14 @@ def test_ranks_and_restarts_agree(tmp_path):
     with pctt.Simulation(blocks(), comm=MPI.COMM_WORLD, **given) as sim:
         sim.run(steps=5)
         sim.save(tmp_path / "middle.h5")
-        sim.run(steps=15)
+        sim.run(steps=8)
         place = sim.positions
     assert ((place[:, 0] - np.arange(12)) > 1e-3).sum() == 4
     with pctt.Simulation.load(tmp_path / "middle.h5", blocks(), comm=MPI.COMM_WORLD, **given) as again:
-        again.run(steps=15)
+        again.run(steps=8)
         np.testing.assert_array_equal(again.positions, place)
     with pctt.Simulation(blocks(), comm=MPI.COMM_SELF, **given) as alone:
-        alone.run(steps=20)
+        alone.run(steps=13)
         np.testing.assert_allclose(alone.positions, place, atol=1e-9)
 
 
