@@ -163,7 +163,7 @@ def slid_off(dome, dt, **motion):
     return 0.5 * speed @ speed / (G * fallen) - 1
 
 
-@pytest.mark.parametrize(("dome", "most"), [(DOME, 1e-3), (PILL, 1e-3), (TOP, 5e-3)])
+@pytest.mark.parametrize(("dome", "most"), [(PILL, 1e-3), (TOP, 5e-3)])
 def test_spheres_keep_their_energy_on_curved_bodies_at_rest(dome, most):
     """The normals of the start, and gaps of the end: of second order in dt; beside the edges of triangles."""
     errors = [abs(slid_off(dome, dt)) for dt in (0.008, 0.004)]
@@ -201,7 +201,7 @@ def test_a_sphere_swings_in_a_bowl_of_triangles():
     assert all(0.98 < swing < 1.005 for swing in swings(scene, 2))
 
 
-@pytest.mark.parametrize(("shape", "settings"), [("along", {}), ("across", {}), ("box", {"dt": 0.005})])
+@pytest.mark.parametrize(("shape", "settings"), [("capsule", {}), ("box", {"dt": 0.005})])
 def test_other_shapes_swing_in_a_trough_of_triangles(shape, settings):
     """Each corner and end finds its own direction at the start. The triangles are 300 times as long as wide: what their
     edges hold is asked across these; else the sides of a box catch on them, and 0.6 to 1.1 of the angle is left."""
@@ -211,13 +211,12 @@ def test_other_shapes_swing_in_a_trough_of_triangles(shape, settings):
     strips = np.concatenate([np.stack([k, k + 1, count + k], 1), np.stack([k + 1, count + k + 1, count + k], 1)])
     scene = Scene(friction=0.0)
     scene.add_body("trough", [Mesh(np.concatenate(corners), strips)])
-    half = {"across": 0.08, "box": 0.04}.get(shape, 0.0)  # what of it lies along the way
+    half = 0.08 if shape == "capsule" else 0.04  # what of it lies along the way
     depth = np.sqrt((0.5 if shape == "box" else 0.45) ** 2 - half**2) - (0.04 if shape == "box" else 0.0)
     place, tilt = [[depth * np.sin(0.6), 0.003, -depth * np.cos(0.6)]], [np.cos(-0.3), 0.0, np.sin(-0.3), 0.0]
-    lying = [np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]
     if shape == "box":
         scene.add_boxes(place, (0.04, 0.04, 0.04), DENSITY, quaternions=[tilt])
     else:
-        turn = [np.cos(np.pi / 4 - 0.3), 0.0, np.sin(np.pi / 4 - 0.3), 0.0] if shape == "across" else lying
+        turn = [np.cos(np.pi / 4 - 0.3), 0.0, np.sin(np.pi / 4 - 0.3), 0.0]
         scene.add_capsules(place, 0.05, 0.08, DENSITY, quaternions=[turn])
     assert 0.985 < swings(scene, 1, **settings)[0] < 1.005

@@ -37,8 +37,9 @@ def column(stiffness: float | None, count: int = 5, squeezed: float = 0.0) -> Sc
 
 @pytest.mark.parametrize(
     "settings",
-    [{"solver": solver, "law": law} for solver in ("apgd", "pdip", "conic") for law in ccp.LAWS]
-    + [{"solver": "apgd", "dt": dt} for dt in (0.002, 0.005, 0.02)],
+    [{"solver": solver, "law": ccp.COULOMB} for solver in ("apgd", "pdip", "conic")]
+    + [{"solver": "apgd", "law": ccp.RELAXATION}]
+    + [{"solver": "apgd", "dt": dt} for dt in (0.002, 0.02)],
     ids=repr,
 )
 def test_a_column_rests_on_the_overlaps_that_its_weight_makes(settings):
