@@ -163,7 +163,7 @@ def slid_off(dome, dt, **motion):
     return 0.5 * speed @ speed / (G * fallen) - 1
 
 
-@pytest.mark.parametrize(("dome", "most"), [(DOME, 1e-3), (PILL, 1e-3), (TOP, 5e-3)])
+@pytest.mark.parametrize(("dome", "most"), [(PILL, 1e-3), (TOP, 5e-3)])
 def test_spheres_keep_their_energy_on_curved_bodies_at_rest(dome, most):
     """The normals of the start, and gaps of the end: of second order in dt; beside the edges of triangles."""
     errors = [abs(slid_off(dome, dt)) for dt in (0.008, 0.004)]
@@ -180,45 +180,43 @@ def test_spheres_keep_their_energy_on_tools_that_move(motion):
 
 
 def swings(scene, count, **settings):
-    """The first angles at which the one grain of a scene turns about on the side where it began, over that of the
-    start."""
+    """The first angles at which the one grain of a scene turns about, on either side, over that of the start."""
     sim, angles = pctt.Simulation(scene, **settings), []
     x = sim.positions[0]
     start = np.arctan2(x[0], -x[2])
-    while sim.time < 2.2 * count * np.pi * np.sqrt(0.45 / G):
+    while sim.time < (count + 0.2) * np.pi * np.sqrt(0.45 / G):
         sim.step()
         x = sim.positions[0]
         angles.append(np.arctan2(x[0], -x[2]))
-    at = np.array(angles) / start
+    at = np.abs(angles) / start
     return at[1:-1][(at[1:-1] > at[:-2]) & (at[1:-1] >= at[2:]) & (at[1:-1] > 0.1)]
 
 
 def test_a_sphere_swings_in_a_bowl_of_triangles():
     """By the default step: what the edges of triangles take is left. With normals of the end 0.8 of it were left."""
     scene = Scene(friction=0.0)
-    scene.add_body("bowl", [Mesh.revolved([(0.5 * np.sin(a), -0.5 * np.cos(a)) for a in np.linspace(0, 1.2, 80)], 160)])
+    arc = [(0.5 * np.sin(a), -0.5 * np.cos(a)) for a in np.linspace(0, 0.66, 45)]
+    scene.add_body("bowl", [Mesh.revolved(arc, 160)])
     scene.add_spheres([[0.45 * np.sin(0.5), 0.001, -0.45 * np.cos(0.5)]], 0.05, DENSITY)
-    first, second = swings(scene, 2)
-    assert 0.96 < second < first < 1.0
+    assert all(0.98 < swing < 1.005 for swing in swings(scene, 2))
 
 
-@pytest.mark.parametrize(("shape", "settings"), [("along", {}), ("across", {}), ("box", {"dt": 0.005})])
+@pytest.mark.parametrize(("shape", "settings"), [("capsule", {}), ("box", {"dt": 0.005})])
 def test_other_shapes_swing_in_a_trough_of_triangles(shape, settings):
     """Each corner and end finds its own direction at the start. The triangles are 300 times as long as wide: what their
     edges hold is asked across these; else the sides of a box catch on them, and 0.6 to 1.1 of the angle is left."""
-    count, a = 400, np.linspace(-1.3, 1.3, 400)
+    count, a = 230, np.linspace(-0.75, 0.75, 230)
     corners = [np.stack([0.5 * np.sin(a), np.full(count, y), -0.5 * np.cos(a)], axis=1) for y in (-0.5, 0.5)]
     k = np.arange(count - 1)
     strips = np.concatenate([np.stack([k, k + 1, count + k], 1), np.stack([k + 1, count + k + 1, count + k], 1)])
     scene = Scene(friction=0.0)
     scene.add_body("trough", [Mesh(np.concatenate(corners), strips)])
-    half = {"across": 0.08, "box": 0.04}.get(shape, 0.0)  # what of it lies along the way
+    half = 0.08 if shape == "capsule" else 0.04  # what of it lies along the way
     depth = np.sqrt((0.5 if shape == "box" else 0.45) ** 2 - half**2) - (0.04 if shape == "box" else 0.0)
     place, tilt = [[depth * np.sin(0.6), 0.003, -depth * np.cos(0.6)]], [np.cos(-0.3), 0.0, np.sin(-0.3), 0.0]
-    lying = [np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]
     if shape == "box":
         scene.add_boxes(place, (0.04, 0.04, 0.04), DENSITY, quaternions=[tilt])
     else:
-        turn = [np.cos(np.pi / 4 - 0.3), 0.0, np.sin(np.pi / 4 - 0.3), 0.0] if shape == "across" else lying
+        turn = [np.cos(np.pi / 4 - 0.3), 0.0, np.sin(np.pi / 4 - 0.3), 0.0]
         scene.add_capsules(place, 0.05, 0.08, DENSITY, quaternions=[turn])
-    assert 0.97 < swings(scene, 1, **settings)[0] < 1.01
+    assert 0.985 < swings(scene, 1, **settings)[0] < 1.005

@@ -89,7 +89,7 @@ def at_rest(scene, seconds, begin, **settings):
     ids=["column", "tower", "1:300", "1:3000", "light on heavy", "heaviest on top", "overhang"],
 )
 def test_the_floor_bears_the_weight_in_every_step_and_nothing_creeps(scene, most):
-    sim, share, creep, energy, iterations = at_rest(scene, 0.9, 0.3)
+    sim, share, creep, energy, iterations = at_rest(scene, 0.55, 0.3)
     assert abs(share.mean() - 1.0) < 1e-3
     assert share.std() < 1e-3  # 0.03 to 0.3 where steps stop as soon as the limits are met
     assert creep < 1e-6
@@ -98,18 +98,18 @@ def test_the_floor_bears_the_weight_in_every_step_and_nothing_creeps(scene, most
     assert sim.figures["unbalanced_force"] < 1e-3
 
 
-@pytest.mark.parallel(2, 3)
+@pytest.mark.parallel(2)
 def test_things_at_rest_on_several_ranks():
     """Few contacts of several ranks are solved by the first one: APGD needs thousands of iterations here."""
-    for scene in (tower(1000.0, 3e6), column(8)):
-        _, share, creep, _, iterations = at_rest(scene, 0.2, 0.12)
+    for scene in (tower(1000.0, 3e6), column(5)):
+        _, share, creep, _, iterations = at_rest(scene, 0.16, 0.12)
         assert share.std() < 1e-3
         assert creep < 5e-6
         assert iterations < 30
 
 
 def test_many_contacts_at_rest():
-    _, share, creep, energy, iterations = at_rest(wall(), 0.9, 0.5)
+    _, share, creep, energy, iterations = at_rest(wall(), 0.6, 0.4)
     assert share.std() < 1e-4
     assert creep < 1e-6
     assert energy < 1e-9
@@ -150,7 +150,7 @@ def test_a_column_is_at_rest_whatever_moves_beside_it(guest, law):
         share.append(abs(sim.contacts.force[on_floor, 2].sum()) / weight)
 
     sim.run(until=0.3)
-    sim.run(until=0.7, call=note)
+    sim.run(until=0.5, call=note)
     assert sim.kinetic_energy > 1e-3
     assert abs(np.mean(share) - 1.0) < 1e-4
     assert np.std(share) < 1e-4  # 0.02 to 0.2 where all islands have the limits of the whole
@@ -158,14 +158,13 @@ def test_a_column_is_at_rest_whatever_moves_beside_it(guest, law):
 
 def test_a_stack_falls_that_hangs_over_too_far():
     sim = pctt.Simulation(overhang(1.06))
-    sim.run(until=0.7)
-    assert sim.positions[-1, 2] < (8 - 1) * H
+    sim.run(until=0.7, stop=lambda sim: sim.positions[-1, 2] < (8 - 1) * H)
+    assert sim.time < 0.7
 
 
-@pytest.mark.parametrize("heavy", [1e9, 1e10])
-def test_a_light_box_under_a_heavy_one_stays(heavy):
-    """By more than six powers of ten: it is not thrown out, and the floor bears the weight."""
-    sim = pctt.Simulation(tower(1000.0, heavy))
+def test_a_light_box_under_a_heavy_one_stays():
+    """By seven powers of ten: it is not thrown out, and the floor bears the weight."""
+    sim = pctt.Simulation(tower(1000.0, 1e10))
     sim.run(until=0.3)
     share = []
     sim.run(until=0.6, call=lambda s: share.append(-s.body("floor").force[2] / (G * s.world.grains.mass.sum())))
@@ -179,10 +178,10 @@ def test_a_pinched_grain_does_not_creep():
     scene.add_body("left", [Box((0.02, 0.1, 0.1), center=(-0.04, 0, 0))])
     scene.add_body("right", [Box((0.02, 0.1, 0.1), center=(0.04, 0, 0))], Guided((1, 0, 0), force=-150.0), mass=1.0)
     sim = pctt.Simulation(scene)
-    sim.run(until=0.5)
+    sim.run(until=0.3)
     start = sim.positions.copy()
-    sim.run(until=1.5)
-    assert np.abs(sim.positions - start).max() < 1e-6
+    sim.run(until=0.7)
+    assert np.abs(sim.positions - start).max() < 4e-7
 
 
 def test_what_moves_is_solved_to_the_limits_alone():
@@ -274,7 +273,7 @@ def test_a_bob_on_a_slow_spring_is_no_jump(dt, damping):
     (bob,) = scene.add_spheres([0, 0, 0], 0.1, 1000.0)
     scene.add_spring("spring", None, bob, anchor=(0, 0, 0.5), stiffness=400.0, length=0.5, damping=damping)
     jumps = []
-    pctt.Simulation(scene, dt=dt).run(until=5.0, call=lambda sim: jumps.append(sim.figures["energy_jump"]))
+    pctt.Simulation(scene, dt=dt).run(until=1.0, call=lambda sim: jumps.append(sim.figures["energy_jump"]))
     assert max(jumps) == 0.0
 
 

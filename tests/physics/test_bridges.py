@@ -19,6 +19,7 @@ RUPTURE = (1 + ANGLE / 2) * VOLUME ** (1 / 3)
 EXACT = {"tol": 1e-9, "closing_work": np.inf}
 
 
+
 def force(gap, radius):
     x = gap * np.sqrt(radius / VOLUME)
     return 2 * np.pi * radius * GAMMA * np.cos(ANGLE) / (1 + 1.05 * x + 2.5 * x**2)
@@ -43,10 +44,10 @@ def apart(speed, gap=0.0, plane=False, **law):
     return scene
 
 
-def followed(scene, until):
+def followed(scene, until, dt):
     """Of each step the gap at its start, the speed after it and the pull; and the work of all."""
     rows, work = [], 0.0
-    with pctt.Simulation(scene, dt=5e-5, **EXACT) as sim:
+    with pctt.Simulation(scene, dt=dt, **EXACT) as sim:
         while sim.time < until:
             sim.step()
             gap, pull = sim.last.contacts.gap, sim.last.system.attraction / sim.last.system.dt
@@ -57,19 +58,20 @@ def followed(scene, until):
 
 @pytest.mark.parametrize("plane", [False, True])
 def test_bodies_that_part_are_pulled_until_the_bridge_ruptures(plane):
-    speed, radius = 0.01, 2 * R if plane else R
-    gap, _, pull, work = followed(apart(speed, plane=plane), 1.1 * RUPTURE / speed)
+    speed, radius, dt = 0.01, 2 * R if plane else R, 2e-4
+    gap, _, pull, work = followed(apart(speed, plane=plane), 1.1 * RUPTURE / speed, dt)
     there = gap < RUPTURE
-    assert there.sum() == pytest.approx(RUPTURE / speed / 5e-5, abs=1)
+    assert there.sum() == pytest.approx(RUPTURE / speed / dt, abs=1)
     np.testing.assert_allclose(pull[there], force(gap[there], radius), rtol=1e-9)
     assert not pull[~there].any()
-    assert work == pytest.approx(-energy(radius), rel=0.02)
+    more = 0.5 * speed * dt * (force(0.0, radius) - force(RUPTURE, radius))  # pulls are those of the start of a step
+    assert work == pytest.approx(-energy(radius) - more, rel=0.005)
 
 
 def test_a_cycle_of_touch_and_separation_costs_the_energy_of_the_bridge():
     speed = 0.01
-    scene = apart(-speed, 0.8 * RUPTURE, restitution=1.0)
-    gap, velocity, pull, work = followed(scene, 2.0 * RUPTURE / speed)
+    scene = apart(-speed, 0.2 * RUPTURE, restitution=1.0)
+    gap, velocity, pull, work = followed(scene, 1.3 * RUPTURE / speed, 5e-5)
     assert velocity[0] < 0.0 < velocity[-1]
     assert not pull[velocity < 0.0].any()
     assert (pull[(velocity > 0.0) & (gap < RUPTURE)][1:] > 0.0).all()
@@ -108,7 +110,7 @@ def test_what_does_not_go_together_is_refused():
         pctt.Simulation(apart(0.0), delta=1e-4)
 
 
-@pytest.mark.parallel(1, 2)
+@pytest.mark.parallel(2)
 def test_ranks_and_restarts_agree(tmp_path):
     def heap():
         scene = Scene(0.4, restitution=0.6, **WET)
@@ -120,16 +122,16 @@ def test_ranks_and_restarts_agree(tmp_path):
 
     given = {"dt": 5e-4, "tol": 1e-8, "closing_work": np.inf, "solver": "apgd"}
     with pctt.Simulation(heap(), comm=MPI.COMM_WORLD, **given) as sim:
-        sim.run(steps=15)
+        sim.run(steps=10)
         sim.save(tmp_path / "middle.h5")
         system = sim.last.system
         stretched = MPI.COMM_WORLD.allreduce(int(((system.attraction > 0.0) & (sim.last.contacts.gap > 1e-6)).sum()))
-        sim.run(steps=15)
+        sim.run(steps=10)
         place = sim.positions
     assert stretched > 3
     with pctt.Simulation.load(tmp_path / "middle.h5", heap(), comm=MPI.COMM_WORLD, **given) as again:
-        again.run(steps=15)
+        again.run(steps=10)
         np.testing.assert_array_equal(again.positions, place)
     with pctt.Simulation(heap(), comm=MPI.COMM_SELF, **given) as alone:
-        alone.run(steps=30)
+        alone.run(steps=20)
         np.testing.assert_allclose(alone.positions, place, atol=1e-7)

@@ -101,7 +101,7 @@ def test_a_pile_of_200_comes_to_rest():
         assert force[2] == pytest.approx(-weight, rel=0.05)
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(2)
 def test_ranks_and_restarts_agree(tmp_path):
     given = {"dt": DT, "tol": 1e-8, "closing_work": np.inf, "solver": "apgd"}
     with pctt.Simulation(pile(27), comm=MPI.COMM_WORLD, **given) as sim:
@@ -184,9 +184,6 @@ def test_files_have_the_spheres(tmp_path):
         sim.run(steps=2)
         sim.complete()
         place, turn, forms = sim.positions, sim.orientations, sim.world.forms
-        pixels = sim.render().pixels
-        assert pixels.ndim == 3
-        assert pixels.std() > 0
     folder = Folder(tmp_path / "run")
     frame = folder.frame(2)
     data = series("bodies", surfaces.Scene(folder, [frame]), frame)

@@ -26,12 +26,16 @@ def on_floor(floor, friction, slope=0.0, way=0.0):
 
 
 def energies(scene, seconds):
-    """Kinetic and potential energy at the first step and at the end, by the defaults."""
+    """Kinetic and potential energy in the middle of a step, as velocities are, soon after the start and at the end, by
+    the defaults."""
     with pctt.Simulation(scene) as sim:
-        sim.step()
-        first = sim.figures["kinetic_energy [J]"] + sim.figures["potential_energy [J]"]
-        sim.run(until=seconds)
-        return first, sim.figures["kinetic_energy [J]"] + sim.figures["potential_energy [J]"]
+        found = []
+        for until in (0.1 * seconds, seconds):
+            sim.run(until=until)
+            before = sim.figures["potential_energy [J]"]
+            row = sim.step()
+            found.append(row["kinetic_energy [J]"] + 0.5 * (before + row["potential_energy [J]"]))
+        return found
 
 
 @pytest.mark.parametrize(("radius", "height", "tilt"), [
@@ -45,8 +49,8 @@ def test_a_wobbling_coin_keeps_its_energy(radius, height, tilt):
     place = np.array([0, 0, radius * np.sin(tilt)]) + height / 2 * np.array([np.sin(tilt), 0, np.cos(tilt)])
     scene = on_floor("plane", 0.5)
     scene.add_grains(place, Cylinder(radius, height), 2000.0, quaternions=turn, angular_velocity=spin)
-    first, last = energies(scene, 12 * np.sqrt(radius / G))
-    assert last == pytest.approx(first, rel=0.004)
+    first, last = energies(scene, 4 * np.sqrt(radius / G))
+    assert last == pytest.approx(first, rel=7e-4)
 
 
 @pytest.mark.parametrize(
@@ -58,20 +62,20 @@ def test_an_ellipsoid_that_topples_rises_again(radii, friction):
     tilt = np.pi / 2 - tilt if radii[0] > radii[2] else tilt  # on its edge, or upright
     place = [0, 0, np.hypot(radii[0] * np.sin(tilt), radii[2] * np.cos(tilt))]
     scene.add_grains(place, Superellipsoid(radii), 2000.0, quaternions=(np.cos(tilt / 2), 0, np.sin(tilt / 2), 0))
-    first, last = energies(scene, 10 * np.sqrt(max(radii) / G))
+    first, last = energies(scene, 5 * np.sqrt(max(radii) / G))
     mass = 2000.0 * 4 / 3 * np.pi * np.prod(radii)
-    assert last - first == pytest.approx(0.0, abs=0.06 * mass * G * (max(radii) - min(radii)))
+    assert last - first == pytest.approx(0.0, abs=0.03 * mass * G * (max(radii) - min(radii)))
 
 
-@pytest.mark.parametrize("radii", [(0.03, 0.03, 0.015), (0.2, 0.1, 0.1), (0.05, 0.03, 0.03)])
+@pytest.mark.parametrize("radii", [(0.03, 0.03, 0.015), (0.2, 0.1, 0.1)])
 def test_an_ellipsoid_rocks_without_loss(radii):
     tilt = 0.5
     scene = on_floor("plane", 0.5)
     place = [0, 0, np.hypot(radii[0] * np.sin(tilt), radii[2] * np.cos(tilt))]
     turn = (np.cos(tilt / 2), 0, np.sin(tilt / 2), 0)
     scene.add_grains(place, Superellipsoid(radii), 2000.0, quaternions=turn)
-    first, last = energies(scene, 20 * np.sqrt(max(radii) / G))
-    assert last == pytest.approx(first, rel=0.01)
+    first, last = energies(scene, 8 * np.sqrt(max(radii) / G))
+    assert last == pytest.approx(first, rel=0.001)
 
 
 @pytest.mark.parametrize("floor", FLOORS)
@@ -80,11 +84,11 @@ def test_a_cylinder_rolls_down_at_two_thirds_of_what_slides(floor):
     scene = on_floor(floor, 0.7, slope)
     scene.add_grains([(0, 0, r)], Cylinder(r, 0.3), 800.0, quaternions=ACROSS)
     with pctt.Simulation(scene, dt=4e-3, tol=1e-8) as sim:
-        sim.run(steps=100)
-        way, speed = 2 / 3 * G * np.sin(slope) * np.array([0.5 * 0.4**2, 0.4])
+        sim.run(steps=50)
+        way, speed = 2 / 3 * G * np.sin(slope) * np.array([0.5 * 0.2 * 0.204, 0.2])  # as implicit steps go
         velocity = sim.local.velocity[0]
         np.testing.assert_allclose(velocity[[0, 1, 4]], [speed, 0, speed / r], rtol=1e-3, atol=1e-3)
-        assert sim.positions[0, 0] == pytest.approx(way, rel=0.02)  # to first order in dt
+        assert sim.positions[0, 0] == pytest.approx(way, rel=1e-3)
 
 
 @pytest.mark.parametrize("floor", FLOORS)
@@ -93,24 +97,24 @@ def test_a_cylinder_stands_without_creep(floor):
     scene = on_floor(floor, 0.5, 0.2, 0.7)
     scene.add_grains([(0, 0, length / 2)], Cylinder(r, length), 1200.0)
     with pctt.Simulation(scene, dt=5e-3, tol=1e-9) as sim:
-        sim.run(steps=60)
+        sim.run(steps=30)
         before = sim.positions[0]
-        sim.run(steps=60)
+        sim.run(steps=20)
         weight = 1200.0 * np.pi * r**2 * length * G
         np.testing.assert_allclose(np.linalg.norm(sim.body("floor").force), weight, rtol=1e-5)
-        np.testing.assert_allclose(sim.positions[0], before, atol=1e-7)
+        np.testing.assert_allclose(sim.positions[0], before, atol=3e-8)
 
 
-@pytest.mark.parametrize(("share", "falls"), [(0.95, False), (1.05, True)])
-@pytest.mark.parametrize("way", [0.1, np.pi / 6])  # towards a point that bears, and between two
-def test_a_cylinder_tips_where_its_weight_leaves_its_end(share, falls, way):
+@pytest.mark.parametrize(("share", "way"), [(0.95, np.pi / 6), (1.05, 0.1)])
+def test_a_cylinder_tips_where_its_weight_leaves_its_end(share, way):
+    """It stands where its weight is between two of the points that bear, and falls where it is above one of them."""
     r, length = 0.1, 0.4
     scene = on_floor("plane", 2.0, share * np.arctan(2 * r / length), way)
     scene.add_grains([(0, 0, length / 2)], Cylinder(r, length), 1000.0)
-    with pctt.Simulation(scene, dt=5e-3, tol=1e-8) as sim:
-        sim.run(steps=80)
+    with pctt.Simulation(scene, dt=5e-3, tol=1e-6) as sim:
+        sim.run(steps=50)
         tilt = 2.0 * np.hypot(*sim.orientations[0, 1:3])
-        assert tilt > 0.1 if falls else tilt < 0.01
+        assert tilt > 0.03 if share > 1.0 else tilt < 0.003
 
 
 def test_an_ellipsoid_rocks_with_the_period_of_its_curvature():

@@ -109,7 +109,7 @@ def test_a_sphere_lands_without_overlap_and_without_bounce(dt):
     assert impulse == pytest.approx(weight * sim.time, rel=1e-9)  # all momentum of the fall
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(1, 2)
 def test_a_plate_moves_a_row_and_keeps_out_of_it(ranks):
     """10 cm a step, a radius: every sphere gets the speed of the plate, one after the other, and none overlaps."""
     scene = Scene(friction=0.3, gravity=(0, 0, 0), stiffness=np.inf)

@@ -34,7 +34,7 @@ def pendulum(dt, length=1.0, kind="hinge"):
 
 
 def test_pendulum_force_and_distance():
-    sim = pendulum(0.005)
+    sim = pendulum(0.01)
     mass = sim.local.mass[0]
     lowest = 0.0
     while sim.time < 0.8:
@@ -73,10 +73,9 @@ def energies(sim, until):
     return np.array(out)
 
 
-@pytest.mark.parametrize("kind", ["hinge", "ball"])
-def test_energy_of_a_pendulum_is_of_second_order_and_does_not_drift(kind):
-    coarse, fine = (np.abs(energies(pendulum(dt, kind=kind), 2.2)) for dt in (0.02, 0.01))
-    assert fine.max() < 2e-3
+def test_energy_of_a_pendulum_is_of_second_order_and_does_not_drift():
+    coarse, fine = (np.abs(energies(pendulum(dt, kind="ball"), 2.2)) for dt in (0.04, 0.02))
+    assert fine.max() < 8e-3
     assert coarse.max() > 3.5 * fine.max()
 
 
@@ -84,7 +83,7 @@ def test_the_period_of_a_pendulum_is_that_of_the_elliptic_integral():
     """From 90 degrees, 2 K(1/2) sqrt(I / m g l) pass between two passages of the lowest point."""
     moment = 1.0 + 0.4 * 0.05**2
     exact, errors = 2.0 * ellipk(0.5) * np.sqrt(moment / G), []
-    for dt in (0.02, 0.01):
+    for dt in (0.04, 0.02):
         sim, passed, before = pendulum(dt), [], 1.0
         while len(passed) < 2:
             sim.step()
@@ -93,43 +92,39 @@ def test_the_period_of_a_pendulum_is_that_of_the_elliptic_integral():
                 passed.append(sim.time - dt * x / (x - before))
             before = x
         errors.append(abs((passed[1] - passed[0]) / exact - 1.0))
-    assert errors[1] < 5e-4
+    assert errors[1] < 2e-3
     assert errors[0] > 3.0 * errors[1]
 
 
 def test_energy_of_a_double_pendulum_is_of_second_order():
     worst = []
-    for dt in (0.01, 0.005):
+    for dt in (0.02, 0.01):
         scene = Scene(friction=0.3)
         one, two = scene.add_spheres([[0.5, 0, 0], [1.0, 0, 0]], 0.05, 1000.0)
         scene.add_joint("pin", None, one, anchor=(0, 0, 0), axis=(0, 1, 0))
         scene.add_joint("elbow", one, two, anchor=(0.5, 0, 0), axis=(0, 1, 0))
-        worst.append(np.abs(energies(simulation(scene, dt), 1.2)).max())
+        worst.append(np.abs(energies(simulation(scene, dt), 0.7)).max())
     assert worst[1] < 0.01
     assert worst[0] > 3.0 * worst[1]
 
 
 def test_a_slider_crank_moves_as_its_geometry_says():
     """Joints and motor have 21 rows for the 18 velocities of three bodies: some are redundant."""
-    crank, rod, errors = 0.3, 1.0, []
-    for dt in (0.02, 0.01):
-        scene = Scene(friction=0.3)
-        one = scene.add_boxes([crank / 2, 0, 0], (crank / 2, 0.05, 0.05), 500.0)[0]
-        two = scene.add_boxes([crank + rod / 2, 0.3, 0], (rod / 2, 0.05, 0.05), 500.0)[0]
-        (three,) = scene.add_spheres([crank + rod, 0.6, 0], 0.05, 500.0)
-        scene.add_joint("crank", None, one, anchor=(0, 0, 0), axis=(0, 1, 0), speed=3.0)
-        scene.add_joint("knee", one, two, anchor=(crank, 0.15, 0), axis=(0, 1, 0))
-        scene.add_joint("head", two, three, anchor=(crank + rod, 0.45, 0), axis=(0, 1, 0))
-        scene.add_joint("bore", None, three, kind="slider", anchor=(crank + rod, 0.6, 0), axis=(1, 0, 0))
-        sim, worst = simulation(scene, dt), 0.0
-        while sim.time < 1.2:
-            sim.step()
-            angle = 3.0 * sim.time
-            exact = crank * np.cos(angle) + np.sqrt(rod**2 - (crank * np.sin(angle)) ** 2)
-            worst = max(worst, abs(sim.positions[2, 0] - exact))
-        errors.append(worst)
-    assert errors[1] < 1e-3
-    assert errors[0] > 3.0 * errors[1]
+    crank, rod = 0.3, 1.0
+    scene = Scene(friction=0.3)
+    one = scene.add_boxes([crank / 2, 0, 0], (crank / 2, 0.05, 0.05), 500.0)[0]
+    two = scene.add_boxes([crank + rod / 2, 0.3, 0], (rod / 2, 0.05, 0.05), 500.0)[0]
+    (three,) = scene.add_spheres([crank + rod, 0.6, 0], 0.05, 500.0)
+    scene.add_joint("crank", None, one, anchor=(0, 0, 0), axis=(0, 1, 0), speed=3.0)
+    scene.add_joint("knee", one, two, anchor=(crank, 0.15, 0), axis=(0, 1, 0))
+    scene.add_joint("head", two, three, anchor=(crank + rod, 0.45, 0), axis=(0, 1, 0))
+    scene.add_joint("bore", None, three, kind="slider", anchor=(crank + rod, 0.6, 0), axis=(1, 0, 0))
+    sim = simulation(scene, 0.02)
+    while sim.time < 1.2:
+        sim.step()
+        angle = 3.0 * sim.time
+        exact = crank * np.cos(angle) + np.sqrt(rod**2 - (crank * np.sin(angle)) ** 2)
+        assert sim.positions[2, 0] == pytest.approx(exact, abs=1e-7)
 
 
 def test_a_hanging_chain_bears_its_weight():
@@ -166,7 +161,7 @@ def wheel(**motor):
 
 
 def test_a_motor_keeps_its_speed_and_is_changed_within_the_loop():
-    sim = simulation(wheel(speed=3.0))
+    sim = simulation(wheel(speed=3.0), 0.01)
     sim.run(until=0.1)
     assert sim.joint("axle").speed == pytest.approx(3.0)
     assert sim.joint("axle").angle == pytest.approx(0.3)
@@ -181,7 +176,7 @@ def test_a_motor_keeps_its_speed_and_is_changed_within_the_loop():
 
 @pytest.mark.parametrize(
     ("gravity", "strength", "seconds", "dt"),
-    [(0.0, 200.0, 0.5, 0.002), (G, 25.0, 4.0, 0.01)],
+    [(0.0, 200.0, 0.3, 0.004), (G, 25.0, 1.5, 0.01)],
 )
 def test_a_weak_motor_stops_at_its_target(gravity, strength, seconds, dt):
     """An arm of 1 m and 4 kg, which bears at most 19.6 N m by its weight, goes up to an angle without passing it."""
@@ -205,19 +200,18 @@ def test_a_weak_slider_stops_at_its_target_beside_its_limit():
     scene.add_joint(
         "rail", None, "cart", kind="slider", anchor=(0, 0, 0), axis=(1, 0, 0), target=2.0, strength=5.0, limits=(-1, 1)
     )
-    sim = simulation(scene, 0.01)
-    sim.run(steps=100)
+    sim = simulation(scene, 0.02)
+    sim.run(steps=50)
     assert sim.joint("rail").position == pytest.approx(1.0, abs=1e-6)
     sim.change("joint rail", target=-0.5)
-    sim.run(steps=150)
+    sim.run(steps=75)
     assert sim.joint("rail").position == pytest.approx(-0.5, abs=1e-6)
 
 
-@pytest.mark.parametrize("start", [0.0, 0.4])
-def test_a_linkage_passes_its_dead_points(start):
+def test_a_linkage_passes_its_dead_points():
     """Two cranks of equal length and a coupler, which may tilt where the three are in line: the motor bears the weight
     of the three."""
-    scene, length = Scene(friction=0.3), 0.3
+    scene, length, start = Scene(friction=0.3), 0.3, 0.4
     up, turn = np.array([np.sin(start), 0, np.cos(start)]), (np.cos(start / 2), 0, np.sin(start / 2), 0)
     cranks = [length / 2 * up, [1, 0, 0] + length / 2 * up]
     scene.add_boxes(cranks, (0.02, 0.02, length / 2), 1000.0, quaternions=[turn, turn])
@@ -226,8 +220,8 @@ def test_a_linkage_passes_its_dead_points(start):
     scene.add_joint("B", None, 1, anchor=(1, 0, 0), axis=(0, 1, 0))
     scene.add_joint("C", 0, 2, anchor=length * up, axis=(0, 1, 0))
     scene.add_joint("D", 1, 2, anchor=[1, 0, 0] + length * up, axis=(0, 1, 0))
-    sim, drives = pctt.Simulation(scene, dt=0.0045), []
-    while sim.time < 2.3:  # once round
+    sim, drives = pctt.Simulation(scene, dt=0.009), []
+    while sim.time < 1.5:  # over both of them
         sim.step()
         drives.append(abs(sim.joint("A").drive))
         assert abs(sim.orientations[2][2]) < 1e-4  # the coupler stays level
@@ -244,16 +238,15 @@ def test_a_ball_without_weight_is_held_from_the_first_step_on():
     assert np.linalg.norm(sim.positions[0]) == pytest.approx(0.05, rel=1e-6)
 
 
-@pytest.mark.parametrize("spin", [200.0, 400.0])
-def test_a_spinning_ball_on_a_joint_nods_as_deep_as_it_should(spin):
+def test_a_spinning_ball_on_a_joint_nods_as_deep_as_it_should():
     """The default step resolves the spin of a sphere that is held beside its centre. At the lowest point of its arm,
     with the moments A about the joint and C about the arm, sin / cos^2 = 2 A m g r / (C w)^2 (energy and momentum)."""
-    scene, r = Scene(0.3), 0.05
+    scene, r, spin = Scene(0.3), 0.05, 200.0
     (ball,) = scene.add_spheres([r, 0, 0], r, 1000.0, angular_velocity=(spin, 0, 0))
     scene.add_joint("pin", None, ball, kind="ball", anchor=(0, 0, 0))
     with pctt.Simulation(scene) as sim:
         depth = []
-        sim.run(until=100.0 / spin, call=lambda sim: depth.append(-sim.positions[0, 2] / r))
+        sim.run(until=30.0 / spin, call=lambda sim: depth.append(-sim.positions[0, 2] / r))
         assert sim.settings.dt * spin <= 0.2 + 1e-9
     x = 2 * 1.4 * r**2 * G * r / (0.4 * r**2 * spin) ** 2
     assert max(depth) == pytest.approx((np.sqrt(1 + 4 * x**2) - 1) / (2 * x), rel=2e-3)
@@ -283,8 +276,8 @@ def test_a_slider_stops_at_its_limit():
     scene = Scene(friction=0.3)
     (ball,) = scene.add_spheres([0, 0, 1], 0.1, 1000.0)
     scene.add_joint("rod", None, ball, kind="slider", anchor=(0, 0, 1), axis=(0, 0, 1), limits=(-0.2, 1.0))
-    sim = simulation(scene)
-    sim.run(until=0.5)
+    sim = simulation(scene, 0.005)
+    sim.run(until=0.3)
     assert sim.joint("rod").position == pytest.approx(-0.2, abs=1e-9)
     assert sim.joint("rod").drive == pytest.approx(sim.local.mass[0] * G)
 
@@ -345,8 +338,8 @@ def test_a_mechanism_of_large_bodies_alone(tmp_path):
     scene.add_joint("pin", None, "boom", anchor=(0, 0, 0), axis=(0, 1, 0))
     with pctt.Simulation(scene, tol=1e-8, comm=MPI.COMM_WORLD, say=lambda text: None) as sim:
         assert sim.settings.delta == pytest.approx(0.03 / 20)
-        sim.write(tmp_path / "out")
-        sim.run(until=0.6)
+        sim.write(tmp_path / "out", every=0, checkpoint_every=100)
+        sim.run(until=0.3)
         at = sim.joint("pin").angle
         # an edge of the post touches the lower side of the boom
         assert 0.85 * np.sin(at) - 0.3 * np.cos(at) == pytest.approx(-0.03, abs=1e-3)
@@ -379,8 +372,8 @@ def test_contacts_and_joints_are_solved_together(solver):
     scene.add_body("bar", [Box((0.4, 0.05, 0.05))], Dynamic(), position=(0.45, 0, 0.2), mass=8.0, inertia=(1, 1, 1))
     scene.add_joint("pin", None, "bar", anchor=(0, 0, 0.2), axis=(0, 1, 0))
     scene.add_joint("foot", "bar", ball, kind="fixed", anchor=(0.9, 0, 0.2))
-    sim = simulation(scene, solver=solver)
-    for _ in range(50):
+    sim = simulation(scene, solver=solver, stiffness=np.inf)
+    for _ in range(10):
         assert sim.step()["converged"]
     bears = (8.0 * 0.45 + sim.local.mass[0]) * G  # about the hinge, the arm of the floor is 1 m
     assert -sim.body("floor").force[2] == pytest.approx(bears, rel=1e-4)
@@ -388,7 +381,7 @@ def test_contacts_and_joints_are_solved_together(solver):
 
 def test_a_cart_whose_wheels_resist_rolling_comes_to_rest():
     """Of two wheels of mass m and a bar of mass M, with N on both together, v' (2 m + M + 2 I / R^2) = -rho N / R."""
-    R, rho, M, v, dt = 0.1, 0.004, 8.0, 0.5, 0.005
+    R, rho, M, v, dt = 0.1, 0.004, 8.0, 0.2, 0.01
     scene = Scene(0.6, rolling=rho)
     scene.add_body("floor", [Plane((0, 0, 1))])
     given = {"mass": M, "inertia": (1, 1, 1), "velocity": (v, 0, 0)}
@@ -400,7 +393,7 @@ def test_a_cart_whose_wheels_resist_rolling_comes_to_rest():
     sim = simulation(scene, dt, stiffness=np.inf)
     m = sim.local.mass[0]
     slower = rho * (2 * m + M) * G / R / (2 * m + M + 2 * 0.4 * m)
-    sim.run(steps=20)
+    sim.run(steps=10)
     assert sim.body("bar").velocity[0] == pytest.approx(v - slower * sim.time, rel=1e-5)
     force = sim.joint("axle 0.3").force  # on the wheel: it brings the wheel and half of the bar to rest
     assert force == pytest.approx([-0.5 * M * -slower, 0, -0.5 * M * G], rel=1e-4, abs=1e-4)
@@ -418,8 +411,8 @@ def test_a_joint_goes_through_the_boundary_of_a_periodic_cell():
         velocity = [[1.0, 0.4, 0], [1.0, 0.8, 0]]
         one, two = scene.add_spheres(inside, 0.08, 1000.0, velocity=velocity)
         scene.add_joint("bar", one, two, kind="fixed", anchor=(0.5 + place, 0.5, 0))
-        sim = simulation(scene, 0.005)
-        sim.run(until=1.3)
+        sim = simulation(scene, 0.02)
+        sim.run(until=0.9)
         runs.append((sim.velocities, sim.positions - begin, sim.joint("bar").force))
     for velocity, way, force in runs[1:]:
         assert velocity == pytest.approx(runs[0][0], abs=1e-9)
@@ -447,18 +440,18 @@ def test_a_motor_presses_a_head_on_the_floor_with_the_force_of_the_closed_form()
     hinge = {"anchor": (0, 0, 1), "axis": (0, 1, 0)}
     scene.add_joint("shoulder", None, "boom", **hinge, speed=0.2, strength=100.0, limits=(-0.3, 1.0))
     scene.add_joint("weld", "boom", head, kind="fixed", anchor=(1, 0, 1))
-    sim = simulation(scene, 0.005, stiffness=np.inf)
+    sim = simulation(scene, 0.01, stiffness=np.inf)
     mass = sim.local.mass[0]
     angle = np.arcsin(0.1 / 1.15)
-    while sim.time < 0.8:
+    while sim.time < 0.6:
         sim.step()
         assert sim.positions[0, 2] > 0.9 - 1e-6  # of the head: it touches, and stays above the floor
         assert sim.joint("shoulder").angle < angle + 1e-6
     moment = (4.0 * 0.5 + mass * 1.15) * G * np.cos(angle)
     bears = (100.0 + moment) / (1.15 * np.cos(angle))
     assert -sim.body("floor").force[2] == pytest.approx(bears, rel=2e-3)
-    sim.change("joint shoulder", speed=-0.2)
-    sim.run(until=3.0)
+    sim.change("joint shoulder", speed=-0.8)
+    sim.run(until=1.2)
     assert sim.joint("shoulder").angle == pytest.approx(-0.3, abs=1e-9)
 
 
@@ -562,23 +555,23 @@ def pusher():
 
 def test_a_restart_goes_on_with_the_same_bits(tmp_path):
     sim = simulation(pusher(), dt=0.01)
-    sim.run(steps=20)
+    sim.run(steps=15)
     sim.change("joint pin", speed=0.5)
     sim.save(tmp_path / "state.h5")
-    sim.run(steps=20)
+    sim.run(steps=8)
     again = pctt.Simulation.load(tmp_path / "state.h5", pusher(), dt=0.01, tol=1e-9, comm=MPI.COMM_SELF)
-    again.run(steps=20)
+    again.run(steps=8)
     assert np.array_equal(again.positions, sim.positions)
     assert again.joint("pin").angle == sim.joint("pin").angle
     assert sim.joint("pin").speed == pytest.approx(0.5, rel=1e-2)
 
 
-@pytest.mark.parallel(2, 3)
+@pytest.mark.parallel(2)
 def test_joints_do_not_depend_on_the_ranks():
     alone = simulation(pusher(), dt=0.01)
     sim = pctt.Simulation(pusher(), dt=0.01, tol=1e-9, comm=MPI.COMM_WORLD)
     for each in (alone, sim):
-        each.run(steps=20)
+        each.run(steps=10)
     assert sim.positions == pytest.approx(alone.positions, abs=1e-6)
     assert sim.joint("pin").force == pytest.approx(alone.joint("pin").force, abs=1e-2)
 
@@ -595,9 +588,9 @@ def test_a_flap_swings_as_ever_while_grains_come_and_go_elsewhere():
         if more:
             region = Block((4, 4, 4), (5, 5, 5))
             scene.add_source("rain", region, radius=0.05, density=1000.0, number_rate=100.0)
-            scene.add_outlet("drain", Block((4, 4, 0), (5, 5, 3.9)))
-        sim = pctt.Simulation(scene, dt=0.005, delta=0.01, tol=1e-9, comm=MPI.COMM_WORLD)
-        sim.run(until=0.4)
+            scene.add_outlet("drain", Block((4, 4, 0), (5, 5, 4.2)))
+        sim = pctt.Simulation(scene, dt=0.01, delta=0.01, tol=1e-9, comm=MPI.COMM_WORLD)
+        sim.run(until=0.25)
         angles.append(sim.joint("hinge").angle)
     assert sim.outlet("drain").count > 0
     assert abs(angles[0]) > 0.5
@@ -707,17 +700,15 @@ def shafts(bend, moment, torque=0.0):
     return simulation(scene, 0.01)
 
 
-@pytest.mark.parametrize("bend", [0.4, 1.1])
-def test_a_universal_joint_turns_shafts_as_cardan_says(bend):
+def test_a_universal_joint_turns_shafts_as_cardan_says():
     """tan(out) = tan(in) cos(bend) and M_in d in = M_out d out, of shafts without inertia."""
+    bend, angles = 1.1, []
     sim = shafts(bend, 1e-5, torque=3.0)
-    angles = []
-
-    sim.run(until=1.2, every=10, call=lambda sim: angles.append([sim.joint(x).angle for x in ("motor", "bearing")]))
+    sim.run(until=0.9, every=10, call=lambda sim: angles.append([sim.joint(x).angle for x in ("motor", "bearing")]))
     a, b = np.transpose(angles)
     np.testing.assert_allclose(np.cos(a) * np.sin(b), np.sin(a) * np.cos(bend) * np.cos(b), atol=1e-7)
     assert np.all(np.cos(a - b) > 0.0)
-    assert np.ptp(a) > 2.0
+    assert np.ptp(a) > 1.5
     begin = a[-1] - 0.01 * 2.0  # of the last step, whose forces are those of its start
     slope = np.cos(bend) / (1.0 - (np.sin(begin) * np.sin(bend)) ** 2)
     assert sim.joint("motor").drive == pytest.approx(3.0 * slope, rel=1e-3)
@@ -728,9 +719,9 @@ def test_a_motor_pays_for_what_comes_out_of_a_universal_joint():
     work = []
     sim.step()
     energy, angle = sim.kinetic_energy, sim.joint("bearing").angle
-    sim.run(until=0.8, call=lambda sim: work.append(sim.joint("motor").drive * 2.0 * sim.settings.dt))
+    sim.run(until=0.4, call=lambda sim: work.append(sim.joint("motor").drive * 2.0 * sim.settings.dt))
     left = sim.kinetic_energy - energy + 1.5 * (sim.joint("bearing").angle - angle)
-    assert left > 1.5
+    assert left > 0.7
     assert sum(work) == pytest.approx(left, rel=0.01)
 
 

@@ -36,7 +36,7 @@ def riding_block(speed, friction, radius):
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_turntable_carries_a_block_while_friction_can_hold_it(solver):
     """Without slip it stays where it is on the table."""
-    speed, radius, friction, dt, count = 3.0, 0.3, 0.5, 0.005, 60
+    speed, radius, friction, dt, count = 3.0, 0.3, 0.5, 0.005, 25
     assert speed**2 * radius < friction * G
     world = riding_block(speed, friction, radius)
     used = 0.0
@@ -196,7 +196,7 @@ def test_what_starts_stops_and_rests_is_no_swing():
 
     stops = Path([0.0, 0.5, 0.6, 1.0, 1.001, 2.0], [(x, 0, 0) for x in (0, 0, 0.1, 0.1, 0.1001, 0.1001)])
     for motion in (Late(), Short(), stops, Shaking(0.0, 300.0)):
-        assert not any("swing" in what for what in needs(moved_by(motion)) if needs(moved_by(motion))[what] < 0.004)
+        assert not any("swing" in what and dt < 0.004 for what, dt in needs(moved_by(motion)).items())
 
 
 def test_a_motion_of_ones_own_is_as_fast_as_it_is():

@@ -43,7 +43,7 @@ def least_gap(sim: Simulation) -> float:
 def test_what_came_is_there_or_has_left_to_the_last_grain(rate):
     sim = Simulation(chute(**rate), comm=MPI.COMM_SELF, **WORDS)
     energies = 0.0
-    for _ in range(150):
+    for _ in range(130):
         before = sim.figures.get("kinetic_energy [J]", 0.0) + sim.figures.get("potential_energy [J]", 0.0)
         sim.step()
         figures, rain, hole = sim.figures, sim.source("rain"), sim.outlet("hole")
@@ -153,9 +153,9 @@ def silo(*names: str, high: float = 0.3, **given) -> Scene:
 
 @pytest.mark.parametrize("name", ["rocks", "clumps"])
 def test_a_bed_that_has_rained_comes_to_rest_on_its_floor(name):
-    sim = Simulation(silo(name, most=12), comm=MPI.COMM_SELF, tol=1e-6)
-    sim.run(until=1.0)
-    assert sim.source(name).count == len(sim.ids) == 12
+    sim = Simulation(silo(name, high=0.12), comm=MPI.COMM_SELF, tol=1e-6)
+    sim.run(until=0.75)
+    assert sim.source(name).count == len(sim.ids) == 6
     assert sim.figures["kinetic_energy [J]"] < 1e-8 * sim.source(name).mass
     assert -sim.body("floor").force[2] == pytest.approx(9.81 * sim.source(name).mass, rel=1e-4)
     assert sim.positions[:, 2].min() > 0.0
@@ -164,11 +164,11 @@ def test_a_bed_that_has_rained_comes_to_rest_on_its_floor(name):
 
 
 def test_grains_of_all_shapes_come_at_their_rates_without_overlaps_and_their_contacts_have_keys_of_their_own():
-    scene = silo(mass_rate=1.0, number_rate=None, most=4)
+    scene = silo(mass_rate=2.0, number_rate=None, most=4)
     scene.add_clumps([(0, 0, 0.03)], Clump([[0, 0, 0.01], [0, 0, -0.01]], [0.02, 0.02]), 2500.0)
     sim = Simulation(scene, comm=MPI.COMM_SELF, **WORDS)
     came, largest = 1, 0
-    while sim.time < 0.25:
+    while sim.time < 0.2:
         sim.step()
         new = np.isin(sim.last.contacts.near.bodies.id, sim.ids[came:])
         contacts, came = sim.last.contacts, len(sim.ids)
@@ -178,10 +178,10 @@ def test_grains_of_all_shapes_come_at_their_rates_without_overlaps_and_their_con
         largest = max(largest, len(contacts.key))
         for name in SHAPES:
             tally, heaviest = sim.source(name), scene.passages.sources[name].extremes().mass.max()
-            due = sim.time - WORDS["dt"] - tally.mass
+            due = 2.0 * (sim.time - WORDS["dt"]) - tally.mass
             assert tally.refused or tally.count == 4 or -1e-9 <= due < heaviest
     assert came == 1 + 4 * len(SHAPES)
-    assert largest > 50
+    assert largest > 30
     assert held(sim)[1] == pytest.approx(
         scene.survey().mass + sum(sim.source(name).mass for name in SHAPES), rel=1e-12)  # fmt: skip
 
@@ -263,7 +263,7 @@ def state(sim: Simulation) -> dict[str, np.ndarray]:
 @pytest.mark.parallel(2, 3)
 def test_the_same_grains_come_and_go_on_any_number_of_ranks():
     """Up to their first contacts to rounding."""
-    scene = chute(number_rate=2000.0, velocity=(0, 0, -1))
+    scene = chute(number_rate=1000.0, velocity=(0, 0, -1))
     together, alone = (Simulation(scene, comm=comm, **WORDS) for comm in (MPI.COMM_WORLD, MPI.COMM_SELF))
     for _ in range(30):
         together.step()
@@ -281,13 +281,13 @@ def test_the_same_grains_come_and_go_on_any_number_of_ranks():
 
 @pytest.mark.parallel(1, 2)
 def test_a_restart_goes_on_with_the_same_bits(tmp_path):
-    comm = MPI.COMM_WORLD
-    sim = Simulation(chute(), comm=comm, **WORDS)
-    sim.run(steps=70)
-    sim.save(tmp_path / "state.h5")
+    comm, scene = MPI.COMM_WORLD, chute(velocity=(0, 0, -1))
+    sim = Simulation(scene, comm=comm, **WORDS)
     sim.run(steps=40)
-    again = Simulation.load(tmp_path / "state.h5", chute(), comm=comm, **WORDS)
-    again.run(steps=40)
+    sim.save(tmp_path / "state.h5")
+    sim.run(steps=20)
+    again = Simulation.load(tmp_path / "state.h5", scene, comm=comm, **WORDS)
+    again.run(steps=20)
     one, other = state(sim), state(again)
     for name, column in one.items():
         np.testing.assert_array_equal(column, other[name])
@@ -314,18 +314,18 @@ def test_a_source_that_was_set_goes_on_after_a_restart(tmp_path):
     sim.save(tmp_path / "state.h5")
     again = Simulation.load(tmp_path / "state.h5", chute(), comm=comm, **WORDS)
     for each in (sim, again):
-        each.run(steps=20)
+        each.run(steps=10)
     one, other = state(sim), state(again)
     for name, column in one.items():
         np.testing.assert_array_equal(column, other[name])
     assert vars(sim.source("rain")) == vars(again.source("rain"))
     count = sim.source("rain").count
     sim.change("source rain", number_rate=0.0)
-    sim.run(steps=20)
+    sim.run(steps=10)
     assert sim.source("rain").count <= count + 1
 
 
-@pytest.mark.parallel(3)
+@pytest.mark.parallel(2)
 def test_the_same_grains_of_all_shapes_come_on_any_number_of_ranks():
     """Up to their first contacts to rounding."""
     scene = silo(high=0.6, number_rate=300.0)

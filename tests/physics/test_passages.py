@@ -36,9 +36,9 @@ def simulation(scene: Scene, dt: float, comm: MPI.Comm = MPI.COMM_SELF) -> pctt.
 
 @pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("kind", ["box", "mesh", "plane", "sphere"])
-def test_no_fast_grain_ends_behind_what_stands_in_its_way(kind):
+def test_no_fast_grain_ends_behind_what_stands_in_its_way(kind, ranks):
     refused = 0
-    for speed in (10.0, 32.0, 100.0, 200.0, 1000.0, 1e5):
+    for speed in (10.0, 32.0, 200.0, 1e5) if ranks == 1 else (32.0, 200.0):
         for dt, height in ((0.01, 1.03), (0.01, 0.37), (0.001, 0.37)):
             scene = target(kind)
             aside = (0.0, 0.0) if kind == "sphere" else (0.02, 0.01)

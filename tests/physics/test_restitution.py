@@ -35,7 +35,7 @@ def test_two_spheres_of_other_masses_part_as_newton_says(stiffness, solver):
 
 @STIFF
 def test_a_ball_bounces_to_lesser_heights_and_comes_to_rest(stiffness):
-    e, fall = 0.7, 1.0
+    e, fall = 0.7, 0.3
     scene = Scene(friction=0.3, stiffness=stiffness)
     scene.add_body("floor", [Plane((0, 0, 1))], material="steel")
     scene.add_spheres([[0, 0, R + fall]], R, DENSITY, material="rubber")
@@ -47,14 +47,14 @@ def test_a_ball_bounces_to_lesser_heights_and_comes_to_rest(stiffness):
             time.append(sim.time)
             height.append(sim.positions[0, 2] - R)
 
-        sim.run(until=3.2, call=note)
+        sim.run(until=1.75, call=note)
         speed = sim.velocities[0, 2]
     height, time = np.array(height), np.array(time)
     first = np.sqrt(2 * fall / G)
     rest = first * (1 + e) / (1 - e)  # of endlessly many bounces
-    assert rest < 3.0
+    assert rest < 1.6
     assert abs(speed) < 1e-9
-    assert np.abs(height[time > 3.1]).max() < 1e-4
+    assert np.abs(height[time > 1.7]).max() < 1e-4
 
 
 @pytest.mark.parametrize("shape", ["sphere", "box"])
@@ -65,18 +65,18 @@ def test_each_bounce_leads_to_e2_of_the_height_before_whatever_the_step(shape, e
     scene = Scene(friction=0.3, restitution=e)
     scene.add_body("floor", [Plane((0, 0, 1))])
     if shape == "box":
-        scene.add_boxes([[0, 0, R + 0.3]], (R, R, R), DENSITY)
+        scene.add_boxes([[0, 0, R + 0.12]], (R, R, R), DENSITY)
     else:
-        scene.add_spheres([[0, 0, R + 0.3]], R, DENSITY)
+        scene.add_spheres([[0, 0, R + 0.12]], R, DENSITY)
     with pctt.Simulation(scene, dt=dt, solver="apgd", **EXACT) as sim:
         tops = []
-        sim.run(until=1.1, call=lambda sim: tops.append(
+        sim.run(until=0.7, call=lambda sim: tops.append(
             sim.positions[0, 2] - R + (sim.velocities[0, 2] - 0.5 * dt * G) ** 2 / (2 * G)
         ))  # fmt: skip
-    first = 0.3 + G * dt**2 / 8  # velocities are those of the middle of a step
+    first = 0.12 + G * dt**2 / 8  # velocities are those of the middle of a step
     bounces = np.cumsum(np.abs(np.diff(tops, prepend=first)) > 1e-6 * first) if e < 1.0 else np.zeros(len(tops))
     np.testing.assert_allclose(tops, first * e ** (2 * bounces), rtol=1e-6)
-    assert e == 1.0 or bounces[-1] == 3  # the fourth after 1.2 s
+    assert e == 1.0 or bounces[-1] == 3  # the fourth after .77 s
 
 
 def test_bodies_at_rest_do_not_bounce():
@@ -84,7 +84,7 @@ def test_bodies_at_rest_do_not_bounce():
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_spheres([[0, 0, R * (2 * k + 1)] for k in range(3)], R, DENSITY)
     with pctt.Simulation(scene, dt=0.005, solver="apgd", **EXACT) as sim:
-        sim.run(steps=200)
+        sim.run(steps=80)
         assert sim.kinetic_energy < 1e-12
 
 
@@ -115,7 +115,7 @@ def test_what_forces_press_on_a_floor_comes_to_rest(shape, by):
     if by == "spring":
         scene.add_spring("push", None, 0, anchor=(0, 0, 5.0), stiffness=2.0, length=4.9 + push / 2.0)
     with pctt.Simulation(scene) as sim:
-        sim.run(until=0.5)
+        sim.run(until=0.15)
         borne = [0.0 if by == "cohesion" else push + weight] * 10
         found = []
         sim.run(steps=10, call=lambda sim: found.append(-sim.body("floor").force[2]))
@@ -131,7 +131,7 @@ def test_a_heap_that_a_load_presses_comes_to_rest():
     scene.add_spheres(2.4 * R * (np.indices((3, 3, 3)).reshape(3, -1).T - 1.0), R, 1.0 / (4 / 3 * np.pi * R**3))
     scene.add_load("wind", force=(-0.5 * G, 0, -G))
     with pctt.Simulation(scene) as sim:
-        sim.run(until=2.5)
+        sim.run(until=1.5)
         assert sim.kinetic_energy < 1e-9
         np.testing.assert_allclose(sim.body("box").force, [-13.5 * G, 0, -27 * G], atol=0.01 * G)
 

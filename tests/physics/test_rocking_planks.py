@@ -40,7 +40,7 @@ def energy(sim, **bodies):
 
 def swinging(plank, log, free):
     """A plank that lies askew on a log, where it would be after rolling there from the middle. Returns its energies
-    over that of rest [J] after .3 s and 1.2 s, by the defaults."""
+    over that of rest [J] after .1 s and .5 s, by the defaults."""
     tilt, own, other = 0.12, (1.0, (0.02, 0.05, 0.06)), (3.0, (0.1, 0.1, 0.0096))
     scene = Scene(1.0)
     if free:
@@ -54,24 +54,24 @@ def swinging(plank, log, free):
     turn = (np.cos(tilt / 2), 0, np.sin(tilt / 2), 0)
     scene.add_body("plank", [PLANKS[plank]], Dynamic(), mass=1.0, inertia=own[1], position=place, quaternion=turn)
     sim, found, bodies = Simulation(scene, comm=MPI.COMM_SELF), [], {"plank": own, **({"log": other} if free else {})}
-    for seconds in (0.3, 1.0):
+    for seconds in (0.1, 0.5):
         sim.run(until=seconds)
         found.append(energy(sim, **bodies) - G * (RADIUS + THICK))
     return found
 
 
-PAIRS = [("box", "capsule"), ("box", "ball"), ("coin", "cylinder"), ("mesh", "cylinder"), ("mesh", "ball")]
+PAIRS = [("box", "capsule"), ("box", "ball"), ("coin", "cylinder"), ("mesh", "cylinder")]
 
 
 @pytest.mark.parametrize(("plank", "log"), PAIRS)
 def test_a_plank_rocks_on_a_log_without_loss(plank, log):
     early, late = swinging(plank, log, free=False)
-    assert late == pytest.approx(early, rel=0.01)
+    assert late == pytest.approx(early, rel=0.006)
 
 
 def test_a_plank_rocks_on_a_log_that_rolls():
     early, late = swinging("box", "cylinder", free=True)
-    assert late == pytest.approx(early, rel=0.02)
+    assert late == pytest.approx(early, rel=0.012)
 
 
 def seesaw(friction, dt):
@@ -85,7 +85,7 @@ def seesaw(friction, dt):
     sim = Simulation(scene, dt=dt, comm=MPI.COMM_SELF)
     sim.step()
     first = energy(sim, plank=plank, ball=ball)
-    sim.run(until=0.5)
+    sim.run(until=0.4)
     error = energy(sim, plank=plank, ball=ball) - first
     return error / sim.figures["kinetic_energy [J]"], sim.body("ball").velocity[4]
 
@@ -98,7 +98,7 @@ def test_a_ball_without_friction_does_not_spin_on_a_plank_that_turns():
 
 def test_a_ball_rolls_on_a_plank_that_turns():
     error, spin = seesaw(1.0, 0.004)
-    assert spin > 10.0
+    assert spin > 8.0
     assert abs(error) < 1.5e-3
 
 
@@ -110,12 +110,12 @@ def test_a_ball_on_a_turntable_goes_on_a_circle():
     sim = Simulation(scene, comm=MPI.COMM_SELF)
     sim.run(until=0.5)  # it slips no more
     time, first = sim.time, complex(*sim.velocities[0, :2])
-    sim.run(until=3.5)
+    sim.run(until=1.5)
     last = complex(*sim.velocities[0, :2])
-    assert abs(last / first - np.exp(2j / 7 * 2.0 * (sim.time - time))) < 1e-3
+    assert abs(last / first - np.exp(2j / 7 * 2.0 * (sim.time - time))) < 3e-4
 
 
-BLOCKS = [(0.1, 0.4, 0.1), (0.1, 0.4, 0.11), (0.1, 0.4, 0.15), (0.01, 0.1, 0.05)]
+BLOCKS = [(0.1, 0.4, 0.1), (0.1, 0.4, 0.11), (0.01, 0.1, 0.05)]
 
 
 @pytest.mark.parametrize(("half", "high", "tilt"), BLOCKS)
@@ -128,7 +128,7 @@ def test_a_block_rocks_as_housner_says(half, high, tilt):
     place = [half - reach * np.sin(steep - tilt), 0, reach * np.cos(steep - tilt)]
     scene.add_boxes([place], (half, 0.2, high), 1000.0, quaternions=[(np.cos(tilt / 2), 0, np.sin(tilt / 2), 0)])
     sim, angles = Simulation(scene, comm=MPI.COMM_SELF), []
-    while sim.time < (2.0 if half > 0.01 else 0.8):
+    while sim.time < (1.4 if half > 0.01 else 0.8):
         sim.step()
         angles.append(2 * np.arctan2(sim.orientations[0, 2], sim.orientations[0, 0]))
     angle = np.array(angles)

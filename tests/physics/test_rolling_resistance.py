@@ -34,7 +34,7 @@ def on_a_plane(slope=0.0, rolling=0.0, spinning=0.0, velocity=(0, 0, 0), angular
 @pytest.mark.parametrize("solver", ["apgd", pytest.param("conic", marks=pytest.mark.slow)])
 def test_a_sphere_rolls_to_rest(solver):
     """v falls by 5/7 g rho / R: m v' = -F, and I v' / R = F R - rho m g."""
-    rho, v, dt = 0.004, 0.5, 0.01
+    rho, v, dt = 0.004, 0.35, 0.01
     slower = 5 / 7 * G * rho / R
     rows = []
     scene = on_a_plane(rolling=rho, velocity=(v, 0, 0), angular_velocity=(0, v / R, 0))
@@ -127,7 +127,7 @@ def heap():
     return scene
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(2)
 def test_ranks_and_restarts_agree(tmp_path):
     given = {"dt": 5e-3, "tol": 1e-8, "closing_work": np.inf}
     with pctt.Simulation(heap(), comm=MPI.COMM_WORLD, **given) as sim:

@@ -36,7 +36,7 @@ def test_three_boxes_on_top_of_each_other_stay_at_rest(twist):
     world = world_of(scene)
     weight = world.grains.mass[0] * G * DT
     known: set[int] = set()
-    for step in steps(world, 100, DT, tol=1e-9):
+    for step in steps(world, 40, DT, tol=1e-9):
         on_floor = step.impulse[step.contacts.b == 3, 0].sum()
         assert on_floor == pytest.approx(3 * weight, rel=1e-5)
         known = known or set(step.contacts.key)
@@ -58,7 +58,7 @@ def test_a_box_on_a_box_holds_below_the_friction_angle_and_slides_above(solver, 
     scene.add_boxes([[-0.2, 0, 0.15]], (0.1, 0.1, 0.05), 1000.0, material="top")
     scene.set_pair("base", "top", friction=friction)
     world = world_of(scene)
-    count = 25
+    count = 15
     step = make_steps(world, count, DT, solver)
     end = by_id(world)
     np.testing.assert_allclose(end["position"][0], [0, 0, 0.05], atol=1e-6)
@@ -75,7 +75,7 @@ def test_a_box_on_a_box_holds_below_the_friction_angle_and_slides_above(solver, 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_capsule_rolls_down_an_incline_at_the_acceleration_of_its_inertia(solver):
     """a = g sin / (1 + I / (m r^2)) across the axis; the step is implicit in the velocity and exact in it."""
-    slope, count, radius = 0.1, 40, 0.1
+    slope, count, radius = 0.1, 15, 0.1
     scene = on_incline(slope, 0.5)
     turn = quaternion.exponential(np.array([np.pi / 2, 0.0, 0.0]))
     scene.add_capsules([[0, 0, radius]], radius, 0.3, 1000.0, quaternions=turn)

@@ -46,14 +46,14 @@ def test_a_block_begins_to_slide_at_the_static_angle(part):
 
 @pytest.mark.parametrize("stiffness", [np.inf, None])
 def test_a_force_that_grows_moves_a_block_when_it_exceeds_static_friction(stiffness):
-    scene, weight, end = block(stiffness=stiffness), MASS * G, 0.4
+    scene, weight, end = block(stiffness=stiffness), MASS * G, 0.2
     scene.add_load("pull", [0], force=lambda time, table: (STICKS * weight * time / end, 0, 0))
     with pctt.Simulation(scene, **{**EXACT, "dt": 0.002}) as sim:
         sim.run(until=0.98 * end)
         assert abs(sim.velocities[0, 0]) < 1e-3
-        sim.run(until=end + 0.2)
-        exact = G * (STICKS * (0.2 + 0.5 * 0.2**2 / end) - SLIDES * 0.2)
-        assert sim.velocities[0, 0] == pytest.approx(exact, rel=0.03)
+        sim.run(until=end + 0.1)
+        exact = G * (STICKS * (0.1 + 0.5 * 0.1**2 / end) - SLIDES * 0.1)
+        assert sim.velocities[0, 0] == pytest.approx(exact, rel=0.06)
 
 
 def test_a_block_that_slides_goes_on_between_the_angles_and_stops_below():
@@ -114,7 +114,7 @@ def test_a_block_at_a_spring_sticks_and_slips():
     np.testing.assert_allclose(leaps, leap, rtol=0.02)
 
 
-@pytest.mark.parallel(1, 2)
+@pytest.mark.parallel(2)
 def test_ranks_and_restarts_agree(tmp_path):
     def blocks():
         scene, x = plane(0.35), np.arange(12.0)
@@ -126,14 +126,14 @@ def test_ranks_and_restarts_agree(tmp_path):
     with pctt.Simulation(blocks(), comm=MPI.COMM_WORLD, **given) as sim:
         sim.run(steps=5)
         sim.save(tmp_path / "middle.h5")
-        sim.run(steps=15)
+        sim.run(steps=8)
         place = sim.positions
     assert ((place[:, 0] - np.arange(12)) > 1e-3).sum() == 4
     with pctt.Simulation.load(tmp_path / "middle.h5", blocks(), comm=MPI.COMM_WORLD, **given) as again:
-        again.run(steps=15)
+        again.run(steps=8)
         np.testing.assert_array_equal(again.positions, place)
     with pctt.Simulation(blocks(), comm=MPI.COMM_SELF, **given) as alone:
-        alone.run(steps=20)
+        alone.run(steps=13)
         np.testing.assert_allclose(alone.positions, place, atol=1e-9)
 
 

@@ -37,14 +37,15 @@ def column(stiffness: float | None, count: int = 5, squeezed: float = 0.0) -> Sc
 
 @pytest.mark.parametrize(
     "settings",
-    [{"solver": solver, "law": law} for solver in ("apgd", "pdip", "conic") for law in ccp.LAWS]
-    + [{"solver": "apgd", "dt": dt} for dt in (0.002, 0.005, 0.02)],
+    [{"solver": solver, "law": ccp.COULOMB} for solver in ("apgd", "pdip", "conic")]
+    + [{"solver": "apgd", "law": ccp.RELAXATION}]
+    + [{"solver": "apgd", "dt": dt} for dt in (0.002, 0.02)],
     ids=repr,
 )
 def test_a_column_rests_on_the_overlaps_that_its_weight_makes(settings):
     stiffness = 1e6
     with pctt.Simulation(column(stiffness), **{"dt": 0.01, **settings, **EXACT}) as sim:
-        sim.run(until=1.5)
+        sim.run(until=0.35)
         height = sim.positions[:, 2]
         overlap = 2 * R - np.diff(np.concatenate([[-R], height]))
         expected = MASS * G * np.arange(5, 0, -1) / stiffness
@@ -57,7 +58,7 @@ def heads_on(stiffness: float, dt: float, steps: int) -> tuple[np.ndarray, float
     """Velocities along x of two spheres after they have met at 2 m/s, and the energy lost by then."""
     scene = Scene(friction=0.0, gravity=(0, 0, 0), stiffness=stiffness)
     for side in (-1, 1):
-        scene.add_spheres([[side * 1.05 * R, 0, 0]], R, DENSITY, velocity=(-side * 1.0, 0, 0))
+        scene.add_spheres([[side * 1.01 * R, 0, 0]], R, DENSITY, velocity=(-side * 1.0, 0, 0))
     with pctt.Simulation(scene, dt=dt, solver="apgd", **EXACT) as sim:
         lost = 0.0
         for _ in range(steps):
@@ -65,13 +66,13 @@ def heads_on(stiffness: float, dt: float, steps: int) -> tuple[np.ndarray, float
         return sim.velocities[:, 0], lost
 
 
-@pytest.mark.parametrize("dt", [1e-5, 1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("dt", [2e-5, 1e-4, 1e-3, 1e-2])
 def test_an_impact_takes_nearly_all_speed_whatever_the_step(dt):
     """5 % are left where the step resolves the impact (Schwager, Poeschel 2007), and none where it is longer."""
-    velocity, lost = heads_on(1e7, dt, max(30, int(0.01 / dt)))
+    velocity, lost = heads_on(1e7, dt, max(30, int(0.006 / dt)))
     assert velocity.sum() == pytest.approx(0.0, abs=1e-9)
     assert -1e-9 <= velocity[1] <= 0.055
-    if dt == 1e-5:
+    if dt == 2e-5:
         assert velocity[1] == pytest.approx(0.048, abs=0.003)
     assert lost == pytest.approx(MASS - MASS * velocity[1] ** 2, rel=0.02)
 
@@ -92,7 +93,7 @@ def test_what_was_squeezed_gives_back_at_most_what_it_holds(dt):
     held = 0.5 * stiffness * squeezed**2 * 5
     with pctt.Simulation(scene, dt=dt, solver="apgd", **EXACT) as sim:
         start, whole = MASS * G * sim.positions[:, 2].sum(), []
-        for _ in range(int(0.3 / dt)):
+        for _ in range(int(0.15 / dt)):
             row = sim.step()
             whole.append([row[f"{name} [J]"] for name in ("kinetic_energy", "potential_energy", "spring_energy")])
     total = np.sum(whole, axis=1) - start
@@ -100,7 +101,7 @@ def test_what_was_squeezed_gives_back_at_most_what_it_holds(dt):
     assert (np.diff(total) < 1e-3 * held).all()
 
 
-@pytest.mark.parametrize("steps", [500, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [100, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_a_block_on_an_incline_does_not_creep(steps):
     """A sticking contact under a constant load does not move: its spring remembers what it holds."""
     angle = np.radians(15.0)
@@ -115,17 +116,17 @@ def test_a_block_on_an_incline_does_not_creep(steps):
     assert moved < 1e-8 * steps
 
 
-@pytest.mark.parametrize(("solver", "dt"), [("apgd", 0.002), ("apgd", 0.01), ("conic", 0.01)])
+@pytest.mark.parametrize(("solver", "dt"), [("apgd", 0.004), ("apgd", 0.01), ("conic", 0.01)])
 def test_friction_gives_way_by_a_spring_and_gives_back(solver, dt):
     """A box on four contacts, each of k_t = 2/7 k, that a force pulls aside: by F / 4 k_t, and then lets go."""
     stiffness, force = 1e6, 40.0  # with twice as much, as it swings, no contact slides
     scene = Scene(friction=0.5, stiffness=stiffness)
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_boxes([[0, 0, 0.05]], (0.2, 0.15, 0.05), DENSITY)
-    scene.add_load("push", force=(force, 0, 0), start=0.4, end=0.8)
+    scene.add_load("push", force=(force, 0, 0), start=0.2, end=0.4)
     with pctt.Simulation(scene, dt=dt, solver=solver, **EXACT) as sim:
         place, energy = [], []
-        for until in (0.4, 0.8, 1.2):
+        for until in (0.2, 0.4, 0.6):
             sim.run(until=until)
             place.append(sim.positions[0, 0])
             energy.append(sim.figures["spring_energy [J]"])
@@ -141,7 +142,7 @@ def test_the_recommended_stiffness_holds_the_bed_and_the_tool():
     assert expected_overlap(scene, stiffness, 0.01) == pytest.approx(0.003, rel=0.05)
     assert stiffness == pytest.approx(4 * 20 * MASS * G / (0.003 * R), rel=0.05)
     with pctt.Simulation(scene, dt=0.01, solver="apgd", **EXACT) as sim:
-        sim.run(steps=100)
+        sim.run(steps=50)
         assert sim.figures["worst_overlap [m]"] <= 0.0031 * R / 4
     for motion, speed in ((Glide((0, 3.0, 0)), 3.0), (Rotation((0, 0, 2.0)), 2.0 * np.sqrt(3.0))):
         scene = Scene(friction=0.3, gravity=(0, 0, 0))
@@ -169,8 +170,8 @@ def test_how_far_a_grain_goes_into_a_contact_that_stops_it():
     scene = Scene(friction=0.0, stiffness=stiffness, gravity=(0, 0, 0))
     scene.add_body("floor", [Plane((0, 0, 1))])
     scene.add_spheres([[0, 0, R]], R, DENSITY, velocity=[[0, 0, -speed]])
-    with pctt.Simulation(scene, dt=0.005 * time, solver="apgd", **EXACT) as sim:
-        overlaps = [sim.step()["worst_overlap [m]"] for _ in range(300)]
+    with pctt.Simulation(scene, dt=0.01 * time, solver="apgd", **EXACT) as sim:
+        overlaps = [sim.step()["worst_overlap [m]"] for _ in range(120)]
     slow, fast = DAMPING - np.sqrt(DAMPING**2 - 1), DAMPING + np.sqrt(DAMPING**2 - 1)
     at = np.log(fast / slow) / (fast - slow)
     most = (np.exp(-slow * at) - np.exp(-fast * at)) / (fast - slow)
