@@ -26,7 +26,7 @@ def test_triaxial_is_isotropic_then_compressed_at_its_rate():
     np.testing.assert_allclose(stress(sim), SMALL.pressure, rtol=0.02)
     assert sim.figures["axial_strain"] == 0.0
     height, first = sim.period[2], sim.steps
-    for _ in range(25):
+    for _ in range(15):
         sim.step()
         figures = sim.figures
         x, y, z = stress(sim)
@@ -73,7 +73,7 @@ def test_analysis_of_a_triaxial_test_finds_the_angles_it_was_given():
 @pytest.mark.parallel(1, 2)
 def test_triaxial_goes_on_after_a_restart_with_the_same_bits(tmp_path):
     sim = pctt.Simulation(LOOSE, comm=MPI.COMM_WORLD, **OF_RUNS)
-    sim.run(steps=8)
+    sim.run(steps=6)
     sim.save(tmp_path / "state.h5")
     other = pctt.Simulation.load(tmp_path / "state.h5", LOOSE, comm=MPI.COMM_WORLD, **OF_RUNS)
     for each in (sim, other):
