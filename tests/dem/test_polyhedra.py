@@ -155,7 +155,8 @@ def test_spheres_find_the_closest_point():
     count = 50
     one, other = random_pairs(count, 3, 0.05)
     right = np.array([signed_distance(one.center[n][None], corners(other, n)) for n in range(count)])
-    right[::2] = [signed_distance(other.center[n][None] + 1e-2, corners(other, n)) for n in range(0, count, 2)]  # inside
+    inside = range(0, count, 2)
+    right[::2] = [signed_distance(other.center[n][None] + 1e-2, corners(other, n)) for n in inside]
     center = np.where(np.arange(count)[:, None] % 2, one.center, other.center + 1e-2)
     radius = np.random.default_rng(0).uniform(0.1, 0.3, count)
     found = spheres_polyhedra(Spheres(center, radius), other, np.full(count, np.inf))
