@@ -182,15 +182,15 @@ def test_springs_are_the_same_on_any_ranks_and_after_a_restart(tmp_path):
 
     one, alone = make(WORLD), make(SELF)
     for sim in (one, alone):
-        sim.run(steps=5)
+        sim.run(steps=3)
         sim.change("spring top", length=0.1 + sim.comm.rank, damping=3.0)
-        sim.run(steps=5)
+        sim.run(steps=3)
     np.testing.assert_allclose(one.positions, WORLD.bcast(alone.positions), atol=1e-6)
     one.save(tmp_path / "state.h5")
     again = make(WORLD, restart=tmp_path / "state.h5")
     assert again.springs["top"].length == 0.1
     for sim in (one, again):
-        sim.run(steps=5)
+        sim.run(steps=3)
     np.testing.assert_array_equal(one.positions, again.positions)
     np.testing.assert_array_equal(one.spring_force("top"), again.spring_force("top"))
 
