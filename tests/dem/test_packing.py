@@ -22,12 +22,12 @@ def gaps(position, radius, box, periodic):
 ])  # fmt: skip
 def test_a_packing_has_its_fraction_and_no_overlap(fraction, periodic):
     box = np.array([1.0, 0.8, 0.9])
-    position, radius = random_packing(box, Uniform(0.05, 0.08), fraction, periodic=periodic, seed=3)
+    position, radius = random_packing(box, Uniform(0.06, 0.09), fraction, periodic=periodic, seed=3)
     volume = 4 / 3 * np.pi * (radius**3).sum()
-    assert fraction <= volume / box.prod() * (1 + 1e-9) < fraction + 4 / 3 * np.pi * 0.08**3 / box.prod()
+    assert fraction <= volume / box.prod() * (1 + 1e-9) < fraction + 4 / 3 * np.pi * 0.09**3 / box.prod()
     assert min(gaps(position, radius, box, periodic)) >= 0.0
-    assert radius.min() >= 0.05
-    assert radius.max() <= 0.08
+    assert radius.min() >= 0.06
+    assert radius.max() <= 0.09
 
 
 def test_equal_spheres_fill_half_of_a_small_box_between_walls():

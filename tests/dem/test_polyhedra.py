@@ -127,7 +127,7 @@ def corners(body, n):
 
 
 def test_the_least_gap_of_a_pair_is_its_signed_distance():
-    count, delta = 120, 0.05
+    count, delta = 80, 0.05
     one, other = random_pairs(count, 0, delta)
     found = polyhedra_polyhedra(one, other, np.full(count, delta))
     gap, most = np.full(count, np.inf), np.zeros(count)
@@ -139,8 +139,8 @@ def test_the_least_gap_of_a_pair_is_its_signed_distance():
     assert touching[right <= delta - tolerance - 1e-9].all()
     assert not touching[right > delta + 1e-9].any()
     assert (np.abs(gap - right)[touching] <= tolerance[touching] + 1e-9).all()
-    assert touching.sum() > 95
-    assert (right < 0).sum() > 25
+    assert touching.sum() > 60
+    assert (right < 0).sum() > 16
     key = found.pair * one.hulls.features + found.feature
     assert len(np.unique(key)) == len(key)
     # Points are in the middle between the surfaces, but for what is round.

@@ -182,8 +182,9 @@ def test_a_servo_that_its_load_helps_and_that_is_stopped_pushes_with_all_its_str
     assert sim.body("stop").force @ line == pytest.approx(strength - 98.1 * line[2] + load, rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["guided", "joint"])
-@pytest.mark.parametrize(("load", "against", "net"), [(-250.0, 300.0, -50.0), (300.0, 900.0, -100.0)])
+@pytest.mark.parametrize(
+    ("kind", "load", "against", "net"), [("joint", -250.0, 300.0, -50.0), ("guided", 300.0, 900.0, -100.0)]
+)
 def test_a_servo_that_bears_a_load_gives_way_where_a_press_needs_more_than_its_strength(kind, load, against, net):
     """500 N, a load on its plate, and a press of 5 kg: what is too much moves both of them."""
     scene = Scene(0.0, gravity=(0, 0, 0))

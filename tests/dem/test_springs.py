@@ -27,7 +27,7 @@ def balls(places, **more):
     return scene
 
 
-def swing(dt, damping, rest=1.0, until=0.6):
+def swing(dt, damping, rest=1.0, until=0.4):
     """Errors of the place of a ball at a spring along z with k = 40 m and c = 2 D sqrt(k m), that starts 0.1 m from
     rest; the speed at the start is that of half a step before."""
     rate, share = np.sqrt(40.0), damping

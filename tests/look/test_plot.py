@@ -17,7 +17,9 @@ from pctt.folder import Folder
 from pctt.look import figures
 
 
-def test_all_figures_are_drawn(show, folder, tmp_path):
+def test_all_figures_are_drawn(show, folder, tmp_path, monkeypatch):
+    # the layout, half of the work, is that of the next test
+    monkeypatch.setitem(figures.STYLE, "figure.constrained_layout.use", False)
     done = show("plot", "-output", tmp_path)
     names = {"steps", "compare", "forces", "torques", "energy", "lengths", "statistics"}
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}.png" for name in names}
