@@ -30,6 +30,7 @@ def test_a_packing_has_its_fraction_and_no_overlap(fraction, periodic):
     assert radius.max() <= 0.09
 
 
+@pytest.mark.slow
 def test_equal_spheres_fill_half_of_a_small_box_between_walls():
     position, radius = random_packing((1, 1, 1), 0.1, 0.5)
     assert 4 / 3 * np.pi * (radius**3).sum() >= 0.5

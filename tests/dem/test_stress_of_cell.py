@@ -42,6 +42,7 @@ def error(sim, asked):
     return np.abs(stress(sim) / asked - 1.0).max()
 
 
+@pytest.mark.slow
 def test_isotropic_cell_reaches_its_stress_and_stays():
     sim = packed()
     sim.run(steps=600, stop=lambda sim: error(sim, PRESSURE) < 0.01)

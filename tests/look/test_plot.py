@@ -111,6 +111,7 @@ def test_the_pattern_is_that_of_the_delassus_matrix(folder):
     np.testing.assert_array_equal(structure.coupling(read, frame).toarray() > 0, there)
 
 
+@pytest.mark.slow
 def test_figures_of_a_small_cluster(folder, tmp_path, monkeypatch):
     read = Folder(folder)
     read.require_frames()
