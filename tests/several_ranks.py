@@ -1,9 +1,9 @@
 """Tests on several ranks, all those of one number of ranks in one start of mpiexec.
 
-`@pytest.mark.parallel(1, 2, 3)` runs a test on 1 and on 3 ranks, and on 2 among the slow tests. Of a test with many
-variants three run on several ranks, and the others among the slow tests. Its communicator is
-`MPI.COMM_WORLD`; its argument `ranks`, if it has one, is the number. On one rank it is a test as any other. On more,
-the first such test that comes up starts `mpiexec -n 3 python -m pytest` with all tests on 3 ranks that were selected;
+`@pytest.mark.parallel(1, 2, 3, 4)` runs a test on 1 and on 3 ranks, and on 2 and 4 among the slow tests. Of a test with
+many variants three run on several ranks, and the others among the slow tests. Its communicator is `MPI.COMM_WORLD`; its
+argument `ranks`, if it has one, is the number. On one rank it is a test as any other. On more, the first such test that
+comes up starts `mpiexec -n 3 python -m pytest` with all tests on 3 ranks that were selected;
 every rank runs them in the same order and writes down how they ended, and the session that was started by hand reports
 that, test by test. A test on which a rank fails, dies or hangs ends that start, and another one goes on behind it.
 
@@ -29,6 +29,7 @@ T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[1]
 INSIDE = "--of-ranks"  # the option by which a pytest inside mpiexec knows the folder where it finds and leaves all
 VARIANTS = 3  # of a test on several ranks that are not slow
+FEW = 3  # ranks, of tests that are not slow
 ENDS = 12000  # characters of what mpiexec said that are shown of a rank that died
 
 
@@ -81,9 +82,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if marker:
         if "ranks" not in metafunc.fixturenames:
             metafunc.fixturenames.append("ranks")
-        # What is right on one rank and on the most is right between them, nearly always.
-        between = set(marker.args) - {1, max(marker.args)}
-        marks = {n: [pytest.mark.mpi] * (n > 1) + [pytest.mark.slow] * (n in between) for n in marker.args}
+        # What is right on one rank and on three is right on other numbers, nearly always.
+        few = {1, max(n for n in marker.args if n <= FEW)}
+        marks = {n: [pytest.mark.mpi] * (n > 1) + [pytest.mark.slow] * (n not in few) for n in marker.args}
         counts = [pytest.param(n, marks=marks[n]) for n in marker.args]
         metafunc.parametrize("ranks", counts, ids=[f"{n} rank{'s' * (n > 1)}" for n in marker.args])
 

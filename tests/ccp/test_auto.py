@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -52,9 +53,9 @@ def test_auto_goes_over_to_conic_where_apgd_takes_long(law, contacts, tol, monke
 
 @pytest.mark.parallel(1, 2)
 def test_much_friction_is_solved_in_turns():
-    """Of 6 random problems of friction 3, of which the conic method alone leaves some unsolved."""
+    """Of 3 random problems of friction 3, of which the conic method alone leaves some unsolved."""
     limits, comm, alone, unsolved = Limits(5e-4, closing_work=0.5, fallback=False), MPI.COMM_WORLD, 0, 0
-    for seed in (11, 12, 13, 15, 24, 30):
+    for seed in (11, 24, 30):
         known, graph = heap(seed, contacts=30, bodies=9, mu=np.full(30, 3.0))
         G = graph.part(comm)
         mine = part(comm, 30)
@@ -93,7 +94,8 @@ def test_where_a_method_fails_one_other_goes_on(type):
 
 
 @pytest.mark.parallel(1, 2)
-def test_where_both_fail_the_better_result_is_used():
+def test_where_both_fail_the_better_result_is_used(monkeypatch):
+    monkeypatch.setitem(ccp.SOLVERS, "apgd", dataclasses.replace(ccp.SOLVERS["apgd"], iterations=1000))
     result = solve("pdip", 1e-30, 30, comm=MPI.COMM_WORLD)
     alone = solve("pdip", 1e-30, 30, comm=MPI.COMM_WORLD, fallback=False)
     assert result.status is not Status.CONVERGED

@@ -174,7 +174,7 @@ def test_little_compliance_on_a_rank_deficient_heap(form):
 
 
 @pytest.mark.parametrize("along", [0.0, 3.5])
-@pytest.mark.parametrize("compliance", [1e-5, 1e-4, 1e-2])
+@pytest.mark.parametrize("compliance", [1e-4, 1e-2])
 def test_methods_agree_on_the_compliant_optimum(compliance, along):
     """Its normal impulses are unique as well. The tangents yield, too, or do not."""
     known, graph = heap(bodies=8)

@@ -4,21 +4,18 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from convert_problems import convert
+from convert_problems import convert, main
 from problems import SELF, Known, dense_of, heap
 
 from pctt import ccp
 from pctt.ccp import fclib
 from pctt.ccp.fclib import FileFormatError, Stored
-
-STUDIES = Path(__file__).resolve().parents[2] / "run" / "studies"
 
 STORAGES = ["dense", "blocks", "triplets", "columns"]
 PROBLEMS = Path(__file__).resolve().parents[3] / "shared" / "problems"
@@ -192,24 +189,29 @@ def test_a_broken_file_is_refused_with_a_reason(tmp_path, what):
     assert list((tmp_path / "fclib").iterdir()) == []
 
 
-def test_the_command_converts_what_it_can_and_names_the_rest(tmp_path):
+def test_the_command_converts_what_it_can_and_names_the_rest(tmp_path, monkeypatch, capsys):
     """Two contacts apart: one is pressed and slides, one opens. The projection of (1, -2, 0) on the cone."""
     text = "3\n2\n0\n6\n6\n6 6\n" + " ".join("1" if i == j else "0" for i in range(6) for j in range(6))
     (tmp_path / "two.dat").write_text(text + "\n-1 2 0  1 0 0\n0.3 0.3\n1\n")
     (tmp_path / "cut.dat").write_text(text[:60])
-    command = [sys.executable, STUDIES / "convert_problems.py", "two.dat", "cut.dat", "absent.dat", "-to", "fclib"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (1, "fclib/two.h5\n")
-    cut, absent = done.stderr.splitlines()
+    monkeypatch.chdir(tmp_path)
+
+    def command(*files):
+        monkeypatch.setattr(sys, "argv", ["convert_problems", *files, "-to", "fclib"])
+        return (main(), *capsys.readouterr())
+
+    *done, said = command("two.dat", "cut.dat", "absent.dat")
+    assert done == [1, "fclib/two.h5\n"]
+    cut, absent = said.splitlines()
     assert cut.startswith("run/study convert_problems: cut.dat: no Siconos problem: it ends too early")
     assert "absent.dat" in absent
     with fclib.read(tmp_path / "fclib" / "two.h5", SELF) as problem:
         result = ccp.solve(problem, None, "conic", ccp.Limits(1e-8), law=ccp.RELAXATION)
         objective = ccp.measure(problem, result.impulse).objective
     assert objective == pytest.approx(-0.5 * (1 + 0.3 * 2) ** 2 / 1.09, rel=1e-7)
-    again = subprocess.run([*command[:3], "fclib/two.h5", *command[-2:]], cwd=tmp_path, capture_output=True, text=True)
-    assert again.returncode == 1
-    assert again.stderr.count("fclib/two.h5 is there already, and is not replaced") == 2
+    status, _, said = command("two.dat", "fclib/two.h5")
+    assert status == 1
+    assert said.count("fclib/two.h5 is there already, and is not replaced") == 2
 
 
 # -- published problems ------------------------------------------------------------------------------------

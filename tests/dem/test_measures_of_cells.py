@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from itertools import product
 
 import numpy as np
@@ -113,10 +114,15 @@ def test_regions_of_too_many_cells_are_refused():
     measures.fabric(cell(np.array([True, False, False])), Block((0, -1e9, -1e9), (2, 1e9, 1e9)))
 
 
+@functools.cache
+def packing():
+    return random_packing((0.08,) * 3, 0.0065, 0.5, periodic=(True,) * 3, seed=1)
+
+
 def pressed(shear=0.0, comm=MPI.COMM_SELF):
     """A dense cell of given stress, or a sheared one, after some steps."""
     size = 0.08
-    x, radius = random_packing((size,) * 3, 0.0065, 0.55, periodic=(True,) * 3, seed=1)
+    x, radius = packing()
     more = {"shear_rate": shear, "shear_gradient": "z"} if shear else {}
     scene = Scene(0.4, gravity=(0, 0, 0), period=(size,) * 3, stress=(1000.0,) * 3, **more)
     scene.add_spheres(x, radius, 2500.0, velocity=np.outer(x[:, 2], [shear, 0, 0]))
@@ -154,9 +160,8 @@ def test_the_whole_cell_has_the_stress_and_the_grains_that_it_has(shear):
     assert measures.solid_fraction(sim.sample, shifted) == pytest.approx(volume, rel=1e-4)
 
 
-@pytest.mark.parametrize("shear", [0.0, 5.0])
-def test_files_of_a_cell_measure_as_the_simulation_does(tmp_path, shear):
-    sim = pressed(shear)
+def test_files_of_a_cell_measure_as_the_simulation_does(tmp_path):
+    sim = pressed(5.0)
     sim.write(tmp_path / "run")
     sim.run(steps=2)
     sim.close()

@@ -419,13 +419,13 @@ def test_without_trimesh_a_mesh_has_contacts_but_no_mass_and_no_file(tmp_path, m
             call()
 
 
-def moved_on(world, steps, dt=0.01):
+def moved_on(world, steps, dt=0.01, tol=1e-9):
     """After each step by Coulomb's law the system and its impulses."""
     for _ in range(steps):
         free = unconstrained(world, dt)
         system = ContactSystem(world, find_contacts(world, 0.01, free), free)
         with cone_problem(system, SELF) as problem:
-            result = ccp.solve(problem, None, "apgd", ccp.Limits(1e-9), law=ccp.COULOMB)
+            result = ccp.solve(problem, None, "apgd", ccp.Limits(tol), law=ccp.COULOMB)
         advance(world, system.motion, system.contacts, system.velocity(result.impulse))
         yield system, result.impulse
 

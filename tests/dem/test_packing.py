@@ -17,21 +17,22 @@ def gaps(position, radius, box, periodic):
 
 
 @pytest.mark.parametrize(("fraction", "periodic"), [
-    (0.15, (False, False, False)), (0.5, (False, False, False)), (0.55, (True, True, False)), (0.6, (True, True, True)),
+    (0.15, (False, False, False)), (0.5, (True, True, False)), (0.55, (True, True, True)),
+    pytest.param(0.6, (True, True, True), marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_a_packing_has_its_fraction_and_no_overlap(fraction, periodic):
     box = np.array([1.0, 0.8, 0.9])
-    position, radius = random_packing(box, Uniform(0.05, 0.08), fraction, periodic=periodic, seed=3)
+    position, radius = random_packing(box, Uniform(0.06, 0.09), fraction, periodic=periodic, seed=3)
     volume = 4 / 3 * np.pi * (radius**3).sum()
-    assert fraction <= volume / box.prod() * (1 + 1e-9) < fraction + 4 / 3 * np.pi * 0.08**3 / box.prod()
+    assert fraction <= volume / box.prod() * (1 + 1e-9) < fraction + 4 / 3 * np.pi * 0.09**3 / box.prod()
     assert min(gaps(position, radius, box, periodic)) >= 0.0
-    assert radius.min() >= 0.05
-    assert radius.max() <= 0.08
+    assert radius.min() >= 0.06
+    assert radius.max() <= 0.09
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_equal_spheres_fill_half_of_a_small_box_between_walls(seed):
-    position, radius = random_packing((1, 1, 1), 0.1, 0.5, seed=seed)
+@pytest.mark.slow
+def test_equal_spheres_fill_half_of_a_small_box_between_walls():
+    position, radius = random_packing((1, 1, 1), 0.1, 0.5)
     assert 4 / 3 * np.pi * (radius**3).sum() >= 0.5
     assert min(gaps(position, radius, np.ones(3), (False,) * 3)) >= 0.0
 
@@ -51,8 +52,8 @@ def test_sizes_of_a_packing_have_their_shares():
 def test_shares_of_a_sieve_curve_are_those_of_the_mass():
     sizes = Listed.by_mass((0.03, 0.06), (1, 3))
     assert sizes.shares == pytest.approx((8 / 11, 3 / 11))
-    radius = random_packing((1, 1, 1), Listed.by_mass((0.02, 0.04), (1, 1)), 0.3, seed=1)[1]
-    assert (radius == 0.02).mean() == pytest.approx(8 / 9, abs=4 * np.sqrt(8 / 81 / len(radius)))
+    radius = random_packing((1, 1, 1), Listed.by_mass((0.03, 0.06), (1, 1)), 0.3, seed=1)[1]
+    assert (radius == 0.03).mean() == pytest.approx(8 / 9, abs=4 * np.sqrt(8 / 81 / len(radius)))
 
 
 def test_several_sizes_of_a_packing_are_alike():

@@ -127,7 +127,7 @@ def corners(body, n):
 
 
 def test_the_least_gap_of_a_pair_is_its_signed_distance():
-    count, delta = 250, 0.05
+    count, delta = 80, 0.05
     one, other = random_pairs(count, 0, delta)
     found = polyhedra_polyhedra(one, other, np.full(count, delta))
     gap, most = np.full(count, np.inf), np.zeros(count)
@@ -139,8 +139,8 @@ def test_the_least_gap_of_a_pair_is_its_signed_distance():
     assert touching[right <= delta - tolerance - 1e-9].all()
     assert not touching[right > delta + 1e-9].any()
     assert (np.abs(gap - right)[touching] <= tolerance[touching] + 1e-9).all()
-    assert touching.sum() > 200
-    assert (right < 0).sum() > 50
+    assert touching.sum() > 60
+    assert (right < 0).sum() > 16
     key = found.pair * one.hulls.features + found.feature
     assert len(np.unique(key)) == len(key)
     # Points are in the middle between the surfaces, but for what is round.
@@ -152,12 +152,14 @@ def test_the_least_gap_of_a_pair_is_its_signed_distance():
 
 
 def test_spheres_find_the_closest_point():
-    one, other = random_pairs(100, 3, 0.05)
-    right = np.array([signed_distance(one.center[n][None], corners(other, n)) for n in range(100)])
-    right[::2] = [signed_distance(other.center[n][None] + 1e-2, corners(other, n)) for n in range(0, 100, 2)]  # inside
-    center = np.where(np.arange(100)[:, None] % 2, one.center, other.center + 1e-2)
-    radius = np.random.default_rng(0).uniform(0.1, 0.3, 100)
-    found = spheres_polyhedra(Spheres(center, radius), other, np.full(100, np.inf))
+    count = 50
+    one, other = random_pairs(count, 3, 0.05)
+    right = np.array([signed_distance(one.center[n][None], corners(other, n)) for n in range(count)])
+    inside = range(0, count, 2)
+    right[::2] = [signed_distance(other.center[n][None] + 1e-2, corners(other, n)) for n in inside]
+    center = np.where(np.arange(count)[:, None] % 2, one.center, other.center + 1e-2)
+    radius = np.random.default_rng(0).uniform(0.1, 0.3, count)
+    found = spheres_polyhedra(Spheres(center, radius), other, np.full(count, np.inf))
     np.testing.assert_allclose(found.touch.gap, right - radius, atol=1e-12)
     ahead = (radius + 0.5 * found.touch.gap)[:, None] * found.touch.normal
     np.testing.assert_allclose(found.touch.point, center + ahead, atol=1e-14)

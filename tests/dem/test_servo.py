@@ -48,11 +48,11 @@ def test_a_wheel_on_a_hinge_turns_by_its_torque_and_stays_in_its_place():
     tilt = (0.5, 0.5, -0.5, 0.5)
     world = world_of([wheel], Hinged(AXIS, torque=3.0, end=0.2), density=100.0, position=(1, 2, 3), quaternion=tilt)
     sphere = world_of([Sphere(0.5)], Hinged(AXIS, torque=3.0), density=100.0, position=(1, 2, 3))
-    for _ in range(30):
+    for _ in range(25):
         step(world)
         step(sphere)
     moment = 0.4 * 0.25 * 100.0 * 4 / 3 * np.pi * 0.125
-    np.testing.assert_allclose(sphere.large.velocity[0], [0, 0, 0, *(3.0 * 0.3 / moment * AXIS)], atol=1e-12)
+    np.testing.assert_allclose(sphere.large.velocity[0], [0, 0, 0, *(3.0 * 0.25 / moment * AXIS)], atol=1e-12)
     speed = world.large.velocity[0, 3:]
     np.testing.assert_allclose(np.cross(speed, AXIS), 0.0, atol=1e-12)
     turn = np.linalg.norm(speed)
@@ -182,8 +182,9 @@ def test_a_servo_that_its_load_helps_and_that_is_stopped_pushes_with_all_its_str
     assert sim.body("stop").force @ line == pytest.approx(strength - 98.1 * line[2] + load, rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["guided", "joint"])
-@pytest.mark.parametrize(("load", "against", "net"), [(-250.0, 300.0, -50.0), (300.0, 900.0, -100.0)])
+@pytest.mark.parametrize(
+    ("kind", "load", "against", "net"), [("joint", -250.0, 300.0, -50.0), ("guided", 300.0, 900.0, -100.0)]
+)
 def test_a_servo_that_bears_a_load_gives_way_where_a_press_needs_more_than_its_strength(kind, load, against, net):
     """500 N, a load on its plate, and a press of 5 kg: what is too much moves both of them."""
     scene = Scene(0.0, gravity=(0, 0, 0))
@@ -191,8 +192,8 @@ def test_a_servo_that_bears_a_load_gives_way_where_a_press_needs_more_than_its_s
     scene.add_body("press", [Box((0.1, 0.1, 0.1))], Guided((-1, 0, 0), force=against), mass=5.0, position=(0.2, 0, 0))
     scene.add_load("load", on="tool", force=(load, 0, 0))
     sim = Simulation(scene, comm=SELF)
-    sim.run(until=0.2)
+    sim.run(until=0.05)
     assert sim.body("tool").velocity[0] == pytest.approx(net / 15.0 * sim.time, rel=0.01)
     sim.change("load load", force=(against - 400.0, 0, 0))  # now it is strong enough
-    sim.run(until=2.0)
+    sim.run(until=1.2)
     assert sim.body("tool").velocity[0] == pytest.approx(0.05, rel=2e-3)

@@ -1,5 +1,7 @@
 """Lees-Edwards shear: images across the boundary move, and nothing else tells where the boundary is."""
 
+import functools
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -11,6 +13,7 @@ from dem.shapes import Plane
 CELL, RATE = (0.9, 1.1, 1.3), 1.5
 
 
+@functools.cache
 def collision(shift, gradient, capsules=False):
     """Two grains that collide obliquely in a sheared cell."""
     scene = Scene(0.4, (0.0, 0.0, 0.0), stiffness=np.inf, period=CELL, shear_rate=RATE, shear_gradient=gradient)
@@ -26,7 +29,7 @@ def collision(shift, gradient, capsules=False):
 
 
 @pytest.mark.parametrize("capsules", [False, True])
-@pytest.mark.parametrize("shift", [(0.0, 0.585, 0.0), (0.41, 0.585, 0.69), (0.395, -0.52, -0.61), (-3.4, 0.59, 0.695)])
+@pytest.mark.parametrize("shift", [(0.0, 0.585, 0.0), (0.395, -0.52, -0.61), (-3.4, 0.59, 0.695)])
 @pytest.mark.parametrize("gradient", ["y", "z"])
 def test_collision_across_the_boundary_is_that_inside(gradient, shift, capsules):
     axis = "xyz".index(gradient)
@@ -71,7 +74,7 @@ def test_affine_flow_keeps_its_profile():
     place = np.array([[x, y, 0.0] for y in height for x in (0.1, 0.3)])
     scene.add_spheres(place, radius=0.06, density=1000.0, velocity=place[:, [1, 2, 2]] * [4.0, 0.0, 0.0])
     sim = pctt.Simulation(scene, dt=0.01)
-    sim.run(steps=150)
+    sim.run(steps=75)
     np.testing.assert_allclose(sim.velocities[:, 0], 4.0 * sim.positions[:, 1], atol=1e-9)
     np.testing.assert_allclose(sim.positions[:, 1], place[:, 1], atol=1e-12)
 

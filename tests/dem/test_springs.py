@@ -27,7 +27,7 @@ def balls(places, **more):
     return scene
 
 
-def swing(dt, damping, rest=1.0, until=0.6):
+def swing(dt, damping, rest=1.0, until=0.4):
     """Errors of the place of a ball at a spring along z with k = 40 m and c = 2 D sqrt(k m), that starts 0.1 m from
     rest; the speed at the start is that of half a step before."""
     rate, share = np.sqrt(40.0), damping
@@ -66,10 +66,10 @@ def test_two_balls_swing_about_their_centre_and_keep_it():
         lengths.append(np.linalg.norm(sim.positions[1] - sim.positions[0]))
         jumps.append(sim.figures["energy_jump [J]"])
 
-    sim.run(steps=200, call=look)
+    sim.run(steps=100, call=look)
     rate = 2 / dt * np.arcsin(np.sqrt(80.0) * dt / 2)
     size = 0.1 / np.cos(rate * dt / 2)
-    np.testing.assert_allclose(lengths, 0.4 + size * np.cos(rate * dt * (np.arange(1, 201) + 0.5)), atol=1e-9)
+    np.testing.assert_allclose(lengths, 0.4 + size * np.cos(rate * dt * (np.arange(1, 101) + 0.5)), atol=1e-9)
     np.testing.assert_allclose(sim.positions.mean(axis=0), [0.25, 0, 0], atol=1e-12)
     assert max(jumps) == 0.0
     pull = 40.0 * BALL * (lengths[-2] - 0.4)
@@ -99,10 +99,10 @@ def test_a_chain_of_damped_springs_has_the_modes_of_its_matrix():
         numbers = {"stiffness": k * BALL, "damping": c * BALL, "length": 0.5}
         scene.add_spring(f"s{n}", *ends, **numbers, other_anchor=wall)
     sim = simulation(scene, dt)
-    sim.run(steps=400)
+    sim.run(steps=200)
     chain = 2 * np.eye(5) - np.eye(5, k=1) - np.eye(5, k=-1)
     rates, modes = np.linalg.eigh(chain)
-    found, time = np.zeros(5), 0.4 + 0.5 * dt
+    found, time = np.zeros(5), 0.2 + 0.5 * dt
     for rate, mode in zip(rates, modes.T):
         decay, turn = 0.5 * c * rate, np.sqrt(k * rate - (0.5 * c * rate) ** 2 + 0j)
         found += mode * (mode[0] * 0.1 * np.exp(-decay * time) * np.sin(turn * time) / turn).real
@@ -119,11 +119,11 @@ def test_anchors_turn_with_their_bodies():
     scene.add_spring("rope", "box", stiffness=1e3, damping=20.0, length=0.5, **anchors)
     sim = simulation(scene, 0.01)
     box = sim.body("box")
-    for _ in range(360):
+    for _ in range(120):
         sim.step()
-        sim.change("load drag", on="box", force=-10.0 * box.velocity[:3], torque=-0.2 * box.velocity[3:])
-    np.testing.assert_allclose(sim.spring_force("rope"), [0, 0, 2.0 * -9.81], atol=1e-2)
-    np.testing.assert_allclose(box.position, [1, 2, 4 - 0.5 - 2.0 * 9.81 / 1e3 - 0.1 * np.sqrt(3)], atol=1e-3)
+        sim.change("load drag", on="box", force=-20.0 * box.velocity[:3], torque=-0.6 * box.velocity[3:])
+    np.testing.assert_allclose(sim.spring_force("rope"), [0, 0, 2.0 * -9.81], atol=0.1)
+    np.testing.assert_allclose(box.position, [1, 2, 4 - 0.5 - 2.0 * 9.81 / 1e3 - 0.1 * np.sqrt(3)], atol=3e-3)
 
 
 def test_springs_pull_at_guided_held_and_prescribed_bodies():
@@ -163,11 +163,11 @@ def test_the_damper_of_a_body_on_the_floor_does_not_see_it_fall():
     scene = Scene(0.3, stiffness=np.inf)
     scene.add_body("belt", [Box((1, 1, 0.1))], position=(0, 0, -0.1), surface_velocity=(0.5, 0, 0))
     scene.add_boxes([0, 0, 0.1], (0.1, 0.1, 0.1), 250.0)
-    scene.add_spring("rope", None, 0, anchor=(0, 0, 0.1), stiffness=400.0, damping=60.0, length=0.0)
+    scene.add_spring("rope", None, 0, anchor=(0, 0, 0.1), stiffness=1600.0, damping=120.0, length=0.0)
     sim = simulation(scene, 0.005)
-    sim.run(steps=250)
+    sim.run(steps=125)
     np.testing.assert_allclose(sim.spring_force("rope"), [-0.3 * 2.0 * 9.81, 0, 0], atol=1e-3)
-    np.testing.assert_allclose(sim.positions[0], [0.3 * 2.0 * 9.81 / 400.0, 0, 0.1], atol=1e-5)
+    np.testing.assert_allclose(sim.positions[0], [0.3 * 2.0 * 9.81 / 1600.0, 0, 0.1], atol=1e-5)
 
 
 @pytest.mark.parallel(1, 2, 3)
@@ -182,15 +182,15 @@ def test_springs_are_the_same_on_any_ranks_and_after_a_restart(tmp_path):
 
     one, alone = make(WORLD), make(SELF)
     for sim in (one, alone):
-        sim.run(steps=5)
+        sim.run(steps=3)
         sim.change("spring top", length=0.1 + sim.comm.rank, damping=3.0)
-        sim.run(steps=5)
+        sim.run(steps=3)
     np.testing.assert_allclose(one.positions, WORLD.bcast(alone.positions), atol=1e-6)
     one.save(tmp_path / "state.h5")
     again = make(WORLD, restart=tmp_path / "state.h5")
     assert again.springs["top"].length == 0.1
     for sim in (one, again):
-        sim.run(steps=5)
+        sim.run(steps=3)
     np.testing.assert_array_equal(one.positions, again.positions)
     np.testing.assert_array_equal(one.spring_force("top"), again.spring_force("top"))
 

@@ -42,19 +42,17 @@ def python():
 
 @pytest.fixture
 def show(folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
-    """`show(program, *options)` runs `python -m pctt.<program>` on the folder; in this process if it is refused."""
-
-    def refused(program: str, *words: object) -> subprocess.CompletedProcess[str]:
-        monkeypatch.setattr(sys, "argv", [program, *map(str, words)])
-        capfd.readouterr()
-        try:
-            status = program_of_folder(importlib.import_module(f"pctt.{program}").main, program)
-        except SystemExit as end:  # of argparse
-            status = end.code
-        return subprocess.CompletedProcess(sys.argv, status, *capfd.readouterr())
+    """`show(program, *options)` runs the program `python -m pctt.<program>` on the folder, in this process."""
 
     def run(program: str, *options: object, status: int = 0, folder: Path = folder) -> subprocess.CompletedProcess[str]:
-        done = refused(program, folder, *options) if status else start("-m", f"pctt.{program}", folder, *options)
+        monkeypatch.setattr(sys, "argv", [program, *map(str, (folder, *options))])
+        monkeypatch.delenv("DISPLAY", raising=False)
+        capfd.readouterr()
+        try:
+            found = program_of_folder(importlib.import_module(f"pctt.{program}").main, program)
+        except SystemExit as end:  # of argparse
+            found = end.code
+        done = subprocess.CompletedProcess(sys.argv, found, *capfd.readouterr())
         assert done.returncode == status, done.stdout + done.stderr
         return done
 

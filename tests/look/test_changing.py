@@ -86,7 +86,7 @@ def test_series_for_paraview_have_the_grains_of_each_step(run):
         assert series("large", scene, folder.frame(step)).GetNumberOfPoints() > 0
 
 
-@pytest.mark.parametrize("colour", ["speed", "id", "size", "material", "force"])
+@pytest.mark.parametrize("colour", ["speed", "material", "force"])
 def test_frames_of_any_number_of_grains_are_drawn(run, colour):
     pytest.importorskip("pctt.look.stage", reason="vtk is not installed (extra `pictures`)")
     from pctt.look.program import View

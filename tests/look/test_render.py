@@ -52,9 +52,9 @@ def test_a_film_of_all_steps(render, folder, tmp_path):
 
 
 def test_a_gif_of_some_steps(render, folder, tmp_path):
-    render("-output", tmp_path, "-first", 2, "-film", "gif", "-fps", 5, folder=folder)
+    render("-output", tmp_path, "-first", 3, "-film", "gif", "-fps", 5, folder=folder)
     with image.open(tmp_path / "film.gif") as film:
-        assert film.n_frames == 3
+        assert film.n_frames == 2
         assert film.info["duration"] == 200
 
 
@@ -134,12 +134,12 @@ def test_bodies_have_the_colours_that_are_given():
 
 def test_a_body_is_drawn_in_its_colour_or_not_at_all(render, folder, tmp_path):
     pure = []
-    for name, bodies in {"red": "mixer=red", "alone": "box=none,mixer=red", "hidden": "mixer=none"}.items():
+    for name, bodies in {"alone": "box=none,mixer=red", "hidden": "mixer=none"}.items():
         render("-output", tmp_path / name, "-first", 4, "-cut", "-bodies", bodies, folder=folder)
         red, green, blue = np.moveaxis(pixels(tmp_path / name / "000004.png")[:, :275], 2, 0)
         pure.append(np.count_nonzero((red > 100) & (green < 40) & (blue < 40)))
-    assert min(pure[:2]) > 100
-    assert pure[2] == 0
+    assert pure[0] > 100
+    assert pure[1] == 0
     done = render("-bodies", "mixr=red", folder=folder, status=2)
     assert "there is no large body 'mixr'; allowed is one of box, mixer; did you mean mixer?" in done.stderr
     assert "mixer: allowed is NAME=COLOR" in render("-bodies", "mixer", folder=folder, status=2).stderr
