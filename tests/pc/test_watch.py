@@ -117,8 +117,7 @@ CASES = {
 
 
 @pytest.mark.parallel(1, 2)
-@pytest.mark.parametrize("side", ["random", "ones"])
-@pytest.mark.parametrize("rtol", [1e-8, 1e-5])
+@pytest.mark.parametrize(("rtol", "side"), [(1e-8, "random"), (1e-5, "ones")])
 @pytest.mark.parametrize("name", CASES)
 def test_a_preconditioner_that_turns_out_wrong_costs_as_much_as_none_again(name, rtol, side):
     make, rank, words = CASES[name]

@@ -207,7 +207,7 @@ def test_another_surface_of_a_tool_is_warned_of(drop, tmp_path):
 
 @pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("name", ["checkpoint.h5", "frames/000002.h5"])
-@pytest.mark.parametrize("flips", [50, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("flips", [15, pytest.param(2000, marks=pytest.mark.slow)])
 def test_a_flipped_bit_is_an_error_on_all_ranks(name, flips, tmp_path, monkeypatch):
     """Anywhere before the seal."""
     monkeypatch.chdir(tmp_path)
