@@ -148,7 +148,7 @@ def test_means_over_cells_are_those_of_the_matrix(shape, block, even, seed) -> N
 @pytest.mark.parametrize("strength", [1000.0, 2500.0])
 def test_parts_of_an_equation_of_the_second_kind_do_not_show_all_of_it(strength) -> None:
     """Of I + h^3 K: a part of few points is near I, and conjugate gradients alone would seem good enough."""
-    n = 60
+    n = 30
     r = np.sqrt((offsets(n, n, n) ** 2).sum(axis=0)) / n
     near = np.where(r > 0, 1 / np.maximum(r, 1 / n), 2.38 * n)
     a = kernel(strength / (4 * np.pi) / n**3 * np.exp(-10 * r) * near, 1.0)

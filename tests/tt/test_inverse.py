@@ -12,8 +12,6 @@ from matrices import laplacian, positive
 from pctt import tt
 from pctt.tt import inverse
 from pctt.tt.inverse import invert_near_identity
-from pctt.tt.train import decompose_matrix
-from pctt.tt.work import Work
 
 
 def exact(dense: np.ndarray, modes: tuple[int, ...]) -> tt.Train:
@@ -56,7 +54,7 @@ def laplacian_and_one(n: int, dimensions: int) -> np.ndarray:
     return A.toarray() + np.eye(n**dimensions) / n
 
 
-@pytest.mark.parametrize(("n", "dimensions", "eps"), [(32, 2, 1e-2), (32, 2, 1e-4), (8, 3, 1e-3)])
+@pytest.mark.parametrize(("n", "dimensions", "eps"), [(16, 2, 1e-2), (16, 2, 1e-4), (8, 3, 1e-3)])
 def test_ranks_grow_until_the_residual_is_small_enough(n: int, dimensions: int, eps: float) -> None:
     dense = laplacian_and_one(n, dimensions)
     S = exact(dense, (2,) * round(np.log2(len(dense))))
@@ -127,12 +125,3 @@ def test_residual_of_high_ranks_is_estimated(monkeypatch: pytest.MonkeyPatch) ->
     measured = tt.residual(S, X)
     monkeypatch.setattr(inverse, "HIGH", 0)
     assert tt.residual(S, X) == pytest.approx(measured, rel=0.5)
-
-
-def test_within_a_limit_of_operations_a_higher_rank_is_not_worse():
-    """The ranks do not grow beyond what later passes can make use of."""
-    size = np.arange(900)
-    A = 1 / (1 + np.add.outer(size, size)) + 1e-3 * np.eye(900)
-    T = decompose_matrix(A / np.diag(A).mean() - np.eye(900), [2, 2, 3, 3, 5, 5], eps=1e-4)
-    left = [invert_near_identity(T, rank, eps=1e-3, work=Work(5e8)).residual for rank in (20, 100)]
-    assert left[1] <= left[0]
