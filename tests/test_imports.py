@@ -25,6 +25,8 @@ def modules():
 def names_in(node, when_it_runs=False):
     """All names that a piece of code imports: anywhere in it, also in functions and for type checkers only; or those
     alone that are imported when it runs, none for type checkers."""
+    if when_it_runs and isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+        return
     for below in ast.iter_child_nodes(node):
         if isinstance(below, ast.Import):
             yield from (alias.name for alias in below.names)
@@ -32,8 +34,7 @@ def names_in(node, when_it_runs=False):
             assert below.level == 0, "relative import"
             yield from (f"{below.module}.{alias.name}" for alias in below.names)
         elif isinstance(below, ast.stmt | ast.excepthandler | ast.match_case):  # no expression imports
-            if not (when_it_runs and isinstance(below, ast.If) and "TYPE_CHECKING" in ast.unparse(below.test)):
-                yield from names_in(below, when_it_runs)
+            yield from names_in(below, when_it_runs)
 
 
 @functools.cache

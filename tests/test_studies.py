@@ -44,7 +44,8 @@ def test_pages_name_studies_that_there_are():
 #: Every study at a small size, but those of other programs, which have to be there, and `convert_problems`, whose
 #: files tests/ccp/test_convert_problems.py has.
 SMALL = [
-    "ranks unfoldings 1", "trains ranks 1 -caps 10 -every 12", "trains reuse 1 -steps 2", "trains scaling 1", "measure steps 1",
+    "ranks unfoldings 1", "trains ranks 1 -caps 10 -every 12",
+    "trains reuse 1 -steps 2", "trains scaling 1", "measure steps 1",
     "measure preconditioners 1 -every 8 -names pbjacobi,tt", "measure laws 1", "measure paper -n 1",
     "measure pdip -n 1", "time_steps mixer4 --starts 1 --settings 6", "windows shear4 --states 1 --settings default "
     "--small dt=.005,tol=1e-3", "profile_problems tests/ccp/hard apgd conic --seconds 2 --laws convex",

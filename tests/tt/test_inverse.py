@@ -11,7 +11,6 @@ from matrices import laplacian, positive
 
 from pctt import tt
 from pctt.tt import inverse
-from pctt.tt.inverse import invert_near_identity
 
 
 def exact(dense: np.ndarray, modes: tuple[int, ...]) -> tt.Train:
