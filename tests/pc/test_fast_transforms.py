@@ -276,7 +276,7 @@ def test_a_larger_rank_is_no_worse_at_a_tiny_limit():
     r, weight = np.hypot(x[:, None] - x, y[:, None] - y), 10 * x * y + 0.1
     A = np.eye(n * n) + weight[:, None] * (100 / n**2 * np.exp(-10 * r)) * weight
     its = []
-    for rank in (10, 20, 100):
+    for rank in (10, 100):
         ksp = ready(shell(lambda i, j: A[i, j], A, grid=(n, n)), rank=rank, setup_limit=3e7)
         its.append(solve(ksp)[0])
         assert its[-1] <= min(its) + 4

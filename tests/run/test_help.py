@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from program import ROOT, SMALL, command, environment
+from program import ROOT, SMALL
 
 import pctt
 from pctt import ccp
@@ -86,8 +86,9 @@ def test_a_reader_that_has_enough_ends_it_without_a_word():
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_an_answer_without_room_is_one_line(cache):
+def test_an_answer_without_room_is_one_line(program, monkeypatch):
+    """And no other at the end, when Python closes the file."""
     with open("/dev/full", "w") as full:
-        more = {"stdout": full, "stderr": subprocess.PIPE, "text": True, "timeout": 60}
-        done = subprocess.run(command("-version"), env=environment(cache), check=False, **more)
-    assert (done.returncode, done.stderr) == (2, "pctt.run: the answer cannot be written (No space left on device)\n")
+        monkeypatch.setattr(sys, "stdout", full)
+        done = program("-version", status=2)
+    assert done.stderr == "pctt.run: the answer cannot be written (No space left on device)\n"
