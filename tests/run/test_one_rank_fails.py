@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 from mpi4py import MPI
-from program import one_line
+from program import one_line, simulated
+
+from dem.together import SceneError
+from pctt.options import OptionError
 
 #: What `{where}` does on one rank; the line that fails is marked.
 SCENE = '''
@@ -123,34 +124,22 @@ CASES = [
     (UNEQUAL_NAMES, ("SceneError", f"{RECORD}: it must return the same names on all ranks, in the same order")),
 ]
 
-PROGRAM = """
-import json, sys
-from mpi4py import MPI
-from pctt.run.options import read_options
-from pctt.run.simulate import simulate
-comm = MPI.COMM_WORLD
-for file in sys.argv[1:]:
-    database = {"scene": file, "steps": "4", "ccp_type": "apgd", "ccp_tol": "1e-3", "quiet": None, "output": file[:-3]}
-    try:
-        simulate(read_options(database, comm), comm)
-        said = "nothing"
-    except Exception as error:
-        said = f"{type(error).__name__}: {error}"
-    told = comm.gather(said)
-    if comm.rank == 0:
-        print(json.dumps(told))
-"""
 
-
-@pytest.mark.mpi
-def test_all_ranks_raise_what_one_of_them_has(mpirun, tmp_path):
-    files = [f"case{k}.py" for k in range(len(CASES))]
-    for file, (text, _) in zip(files, CASES):
-        (tmp_path / file).write_text(text)
-    lines = mpirun(PROGRAM, 3, *files).splitlines()
-    assert len(lines) == len(CASES)
-    for file, line, (text, (kind, words)) in zip(files, lines, CASES):
-        assert json.loads(line) == [f"{kind}: {words.format(file=file, line=line_of_failure(text))}"] * 3
+@pytest.mark.parallel(3)
+def test_all_ranks_raise_what_one_of_them_has(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    comm = MPI.COMM_WORLD
+    for k, (text, (kind, words)) in enumerate(CASES):
+        file = f"case{k}.py"
+        if comm.rank == 0:
+            (tmp_path / file).write_text(text)
+        comm.Barrier()
+        database = {"scene": file, "steps": "4", "ccp_type": "apgd", "ccp_tol": "1e-3", "quiet": None, "output": f"{k}"}
+        with pytest.raises((SceneError, OptionError)) as failure:
+            simulated(database, comm)
+        assert type(failure.value).__name__ == kind
+        said = words.format(file=file, line=line_of_failure(text))
+        assert comm.allgather(str(failure.value)) == [said] * 3
 
 
 @pytest.mark.parallel(1, 2)
