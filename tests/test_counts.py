@@ -82,11 +82,11 @@ MOST = {  # the sums, as counted
         "inverse": {"ranks": 249, "sweeps": 8, "residual [1e-4]": 19},
     },
     "preconditioners": {
-        "a matrix that changes, none": {"steps": 53, "new trains": 4},
-        "a matrix that changes, cores": {"steps": 50, "new trains": 4},
-        "a matrix that changes, trains": {"steps": 129, "new trains": 2},
-        "transforms by choice": {"steps": 16},
-        "three quarters of a cosine transform": {"steps": 172},
+        "a matrix that changes, none": {"steps": 35, "new trains": 4},
+        "a matrix that changes, cores": {"steps": 35, "new trains": 4},
+        "a matrix that changes, trains": {"steps": 86, "new trains": 2},
+        "transforms by choice": {"steps": 11},
+        "three quarters of a cosine transform": {"steps": 127},
     },
     "steps": {
         "thrown": {
@@ -237,14 +237,14 @@ def preconditioners(patch: pytest.MonkeyPatch) -> Counter[str]:
     for reuse in ("none", "cores", "trains"):
         mat = poisson(24)
         ksp = ready(mat, rank=10, reuse=reuse)
-        for shift in (0.0, 0.3, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0):
+        for shift in (0.0, 0.3, 0.0, 0.0, 1.0, 0.0, 0.0, 3.0):
             mat.shift(shift)
             steps, left = solve(ksp)
             assert left < 1e-6
             counts[f"a matrix that changes, {reuse}: steps"] += steps
         account = context(ksp).account
         counts[f"a matrix that changes, {reuse}: new trains"] = account.setups - account.kept
-    for length in (1.0, 3.0, 10.0):
+    for length in (1.0, 10.0):
         ksp = ready(from_differences(lambda s, length=length: np.exp(-np.sqrt((s**2).sum(axis=0)) / length), (24, 20)))
         counts["transforms by choice: steps"] += solve(ksp)[0]
         away = np.sqrt((np.indices((40, 40)) ** 2.0).sum(axis=0)) / (3 * length)

@@ -403,10 +403,12 @@ def test_the_block_says_what_it_needs(monkeypatch):
 
 
 @pytest.mark.parametrize(("name", "n"), [("half_space", 36), ("block", 3)])
-def test_pictures_of_cone_problems(name, n, tmp_path):
+def test_pictures_of_cone_problems(name, n, tmp_path, monkeypatch):
     matplotlib = pytest.importorskip("matplotlib", reason="matplotlib is not installed (extra `figures`)")
     if name == "block":
         pytest.importorskip("skfem", reason="scikit-fem is not installed (extra `examples`)")
     matplotlib.use("agg")
-    importlib.import_module(name).main(n, str(tmp_path / "picture.png"))
+    example = importlib.import_module(name)
+    monkeypatch.setattr(example, "STEPS", 2)
+    example.main(n, str(tmp_path / "picture.png"))
     assert (tmp_path / "picture.png").stat().st_size > 10_000

@@ -182,9 +182,8 @@ def test_a_bad_numerical_parameter_of_a_scene_file_is_refused_before_any_work(li
 
 @pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("options", FROM_OUTSIDE)
-def test_a_bad_option_ends_the_program_with_one_line(options, ranks, program, results):
-    own = ranks == 1 and options == "-pc_type nosuch"
-    check_words(refused(program, results, *options.split(), own=own).partition(": ")[2], options)
+def test_a_bad_option_ends_the_program_with_one_line(options, program, results):
+    check_words(refused(program, results, *options.split()).partition(": ")[2], options)
 
 
 @pytest.mark.parametrize("words", ["results", "-steps 3 results", "-quiet -steps 3 4", "- -steps 3"])

@@ -61,7 +61,7 @@ def test_without_options_the_program_is_the_demo(program, tmp_path):
 
 
 def test_fallbacks_of_a_train_reach_the_summary(program, settled, tmp_path):
-    summary, _ = compared(program, tmp_path, "-compare", "pbjacobi,tt", "-compare_tt_pc_tt_rank", "10")
+    summary, _ = compared(program, tmp_path, "-compare", "pbjacobi,tt", "-compare_tt_pc_tt_rank", "4")
     assert "pc_report" not in summary["compare"]["pbjacobi"]
     report = summary["compare"]["tt"]["pc_report"]
     assert report[0].startswith("tensor train")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import resource
 import shutil
 import subprocess
+import tempfile
 
 import numpy as np
 import pytest
@@ -172,10 +175,14 @@ def test_a_disk_that_fills_up_ends_the_run(ranks, small_disk, program, tmp_path)
     assert check_whole(tmp_path / "left" / "out") == step + 1
 
 
-def test_a_folder_on_a_disk_that_cannot_be_written_is_refused_before_any_work(small_disk, tmp_path):
-    done = small_disk("ro", *SMALL, *EVERY, *LOOSE, "-steps", 1, "-output", "disk/out")
+def test_a_folder_on_a_disk_that_cannot_be_written_is_refused_before_any_work(program, monkeypatch, tmp_path):
+    def read_only(dir):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(dir))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", read_only)
+    done = program(*SMALL, *EVERY, *LOOSE, "-steps", 1, "-output", "disk/out", status=2)
     said = one_line(done, 2)
     for word in ("-output disk/out", "Read-only file system", "allowed is a folder that can be written"):
         assert word in said
     assert done.stdout == ""
-    assert not list((tmp_path / "left").iterdir())
+    assert not list((tmp_path / "disk" / "out").iterdir())

@@ -18,7 +18,7 @@ def exact(dense: np.ndarray, modes: tuple[int, ...]) -> tt.Train:
 
 
 @given(seed=st.integers(0, 2**32 - 1), b=st.sampled_from([1, 3]), modes=st.sampled_from([(3, 4), (2, 2, 3), (12,)]))
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_full_rank_inverse_is_exact(seed: int, b: int, modes: tuple[int, ...]) -> None:
     dense = positive(np.random.default_rng(seed), 12, b).dense()
     S = exact(dense, tt.scalar_modes(modes, b))
@@ -29,7 +29,7 @@ def test_full_rank_inverse_is_exact(seed: int, b: int, modes: tuple[int, ...]) -
 
 
 @given(seed=st.integers(0, 2**32 - 1), rank=st.integers(1, 12))
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_residual_and_symmetry(seed: int, rank: int) -> None:
     dense = positive(np.random.default_rng(seed), 36, 2).dense()
     S = exact(dense, (3, 4, 6))
@@ -96,7 +96,7 @@ def test_indefinite_matrices_are_reported() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_lowest_eigenvalue_is_bounded_from_above(seed: int) -> None:
     X = tt.random([3, 4, 5], 3, [3, 4, 5], np.random.default_rng(seed))
     X = X + X.T
