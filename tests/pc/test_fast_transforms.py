@@ -233,7 +233,6 @@ class Fit:
         A[:] = dense_of(self, self.side**2)
 
 
-@pytest.mark.parallel(1, 2)
 def test_a_refusal_holds_for_its_values():
     """Easy hyperparameters after hard ones get the train that they get in a new solver."""
     fit = Fit()
@@ -249,7 +248,7 @@ def test_a_refusal_holds_for_its_values():
             ksp.setOperators(mat)
             ksp.setUp()
         assert bool(made(ksp).failure) == refused
-        assert any("takes over" in str(one.message) for one in heard) == (refused and MPI.COMM_WORLD.rank == 0)
+        assert any("takes over" in str(one.message) for one in heard) == refused
         if not refused:
             its, _ = solve(ksp)
             assert its == solve(ready(mat, rank=8))[0]
