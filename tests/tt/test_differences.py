@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pctt.tt import differences as of
 from pctt.tt.conjugate import ConjugateGradients, iterations, race
 
-SHAPES = st.lists(st.integers(1, 6), min_size=1, max_size=3).map(tuple)
+SHAPES = st.lists(st.integers(1, 6), min_size=1, max_size=3).map(tuple).filter(lambda shape: np.prod(shape) <= 36)
 
 
 def basis(n: int, kind: str) -> np.ndarray:
