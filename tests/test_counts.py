@@ -42,7 +42,6 @@ MOST = {  # the sums, as counted
         "conic, relaxation, wide masses": {"iterations": 102, "Krylov steps": 204},
         "pdip, relaxation, stored": {"iterations": 40, "Krylov steps": 491},
         "pdip, relaxation, heaps": {"iterations": 239, "Krylov steps": 2893},
-        "pdip, relaxation, wide masses": {"iterations": 231, "Krylov steps": 2591},
         "auto, relaxation, stored": {"iterations": 66, "Krylov steps": 36, "Newton steps": 18},
         "auto, relaxation, heaps": {"iterations": 335, "Krylov steps": 191, "Newton steps": 95},
         "auto, relaxation, wide masses": {"iterations": 328, "Krylov steps": 176, "Newton steps": 88},
@@ -50,7 +49,6 @@ MOST = {  # the sums, as counted
         "barzilai_borwein, relaxation, heaps": {"iterations": 1180},
         "gauss_seidel, relaxation, stored": {"iterations": 180},
         "gauss_seidel, relaxation, heaps": {"iterations": 1840},
-        "gauss_seidel, relaxation, wide masses": {"iterations": 3440},
         "apgd, coulomb, stored": {"iterations": 101},
         "apgd, coulomb, heaps": {"iterations": 962},
         "apgd, coulomb, wide masses": {"iterations": 1157},
@@ -65,30 +63,30 @@ MOST = {  # the sums, as counted
         "conic, coulomb, wedged": {"iterations": 103, "Krylov steps": 236},
         "conic, relaxation, wedged": {"iterations": 66, "Krylov steps": 168},
         "auto, 1e-7": {"iterations": 2566, "Krylov steps": 377, "Newton steps": 187},
-        "a jam comes loose": {"iterations": 243, "Krylov steps": 1380},
+        "a jam comes loose": {"iterations": 100, "Krylov steps": 598},
     },
     "systems": {
-        "pdip, contact": {"iterations": 135, "Krylov steps": 1824, "PCSetUp": 135, "PCApply": 3800},
-        "conic, contact": {"iterations": 61, "Krylov steps": 1554, "PCSetUp": 61, "PCApply": 3232},
-        "pdip, body": {"iterations": 134, "Krylov steps": 1425, "PCSetUp": 65, "PCApply": 123},
-        "conic, body": {"iterations": 63, "Krylov steps": 1464, "PCSetUp": 12, "PCApply": 28},
-        "pdip, factor": {"iterations": 135, "Krylov steps": 292, "PCSetUp": 135, "PCApply": 292},
-        "conic, factor": {"iterations": 61, "Krylov steps": 119, "PCSetUp": 61, "PCApply": 119},
-        "pdip, short": {"iterations": 133, "Krylov steps": 1507, "fallbacks": 75, "PCSetUp": 206, "PCApply": 3161},
-        "conic, short": {"iterations": 61, "Krylov steps": 1359, "fallbacks": 73, "PCSetUp": 107, "PCApply": 2842},
-        "pdip, petsc": {"iterations": 133, "Krylov steps": 160, "PCSetUp": 133, "PCApply": 160},
-        "conic, petsc": {"iterations": 62, "Krylov steps": 121, "PCSetUp": 62, "PCApply": 121},
+        "pdip, contact": {"iterations": 87, "Krylov steps": 1225, "PCSetUp": 87, "PCApply": 2549},
+        "conic, contact": {"iterations": 41, "Krylov steps": 1021, "PCSetUp": 41, "PCApply": 2125},
+        "pdip, body": {"iterations": 87, "Krylov steps": 846, "PCSetUp": 45, "PCApply": 80},
+        "conic, body": {"iterations": 42, "Krylov steps": 973, "PCSetUp": 10, "PCApply": 22},
+        "pdip, factor": {"iterations": 88, "Krylov steps": 189, "PCSetUp": 88, "PCApply": 189},
+        "conic, factor": {"iterations": 41, "Krylov steps": 81, "PCSetUp": 41, "PCApply": 81},
+        "pdip, short": {"iterations": 87, "Krylov steps": 980, "fallbacks": 50, "PCSetUp": 136, "PCApply": 2056},
+        "conic, short": {"iterations": 41, "Krylov steps": 901, "fallbacks": 48, "PCSetUp": 73, "PCApply": 1884},
+        "pdip, petsc": {"iterations": 87, "Krylov steps": 106, "PCSetUp": 87, "PCApply": 106},
+        "conic, petsc": {"iterations": 41, "Krylov steps": 81, "PCSetUp": 41, "PCApply": 81},
     },
     "trains": {
-        "cross": {"evaluations": 160235, "sweeps": 10, "ranks": 345, "error [1e-4]": 9},
-        "inverse": {"ranks": 702, "sweeps": 17, "residual [1e-4]": 48},
+        "cross": {"evaluations": 62863, "sweeps": 4, "ranks": 138, "error [1e-4]": 4},
+        "inverse": {"ranks": 249, "sweeps": 8, "residual [1e-4]": 19},
     },
     "preconditioners": {
-        "a matrix that changes, none": {"steps": 53, "new trains": 4},
-        "a matrix that changes, cores": {"steps": 50, "new trains": 4},
-        "a matrix that changes, trains": {"steps": 129, "new trains": 2},
-        "transforms by choice": {"steps": 16},
-        "three quarters of a cosine transform": {"steps": 172},
+        "a matrix that changes, none": {"steps": 35, "new trains": 4},
+        "a matrix that changes, cores": {"steps": 35, "new trains": 4},
+        "a matrix that changes, trains": {"steps": 86, "new trains": 2},
+        "transforms by choice": {"steps": 11},
+        "three quarters of a cosine transform": {"steps": 127},
     },
     "steps": {
         "thrown": {
@@ -104,8 +102,8 @@ MOST = {  # the sums, as counted
     "flows": {"a sheared cell": {"iterations": 1881}},
     "memory": {"a bed": {"bytes of a grain": 3282}},
     "calls": {
-        "ten boxes": {"functions of Python": 66650}, "a pendulum": {"functions of Python": 53634},
-        "ten balls at rest": {"functions of Python": 39711},
+        "ten boxes": {"functions of Python": 30251}, "a pendulum": {"functions of Python": 18555},
+        "ten balls at rest": {"functions of Python": 15391},
     },
 }  # fmt: skip
 
@@ -152,7 +150,8 @@ def methods(patch: pytest.MonkeyPatch) -> Counter[str]:
     cases += [(ccp.COULOMB, each) for each in ("apgd", "conic", "auto", "barzilai_borwein")]
     for law, method in cases:
         limits = ccp.Limits(1e-5 if method in ("conic", "pdip") else 1e-4)
-        for name, each in list(problems.items())[: 2 if method == "barzilai_borwein" else 3]:
+        dear = method in ("barzilai_borwein", "pdip", "gauss_seidel")
+        for name, each in list(problems.items())[: 2 if dear else 3]:
             solved = (ccp.solve(*given, type=method, law=law, limits=limits) for given in each)
             counts += tally(f"{method}, {law}, {name}", solved)
     for law in ccp.LAWS:
@@ -161,7 +160,7 @@ def methods(patch: pytest.MonkeyPatch) -> Counter[str]:
     exact = (ccp.solve(*given, type="auto", law=law, limits=ccp.Limits(1e-7)) for given in heaps() for law in ccp.LAWS)
     counts += tally("auto, 1e-7", exact)
     loose = []
-    for seed, (problem, _) in enumerate(heaps(bodies=50)):
+    for seed, (problem, _) in enumerate(heaps(4, bodies=50)):
         guess = np.zeros_like(problem.r)
         guess[:, 0] = 1e6 * np.random.default_rng(seed).uniform(0.5, 2.0, len(guess))
         loose += [ccp.solve(problem, guess, type=method, law=ccp.RELAXATION) for method in ("pdip", "conic")]
@@ -194,7 +193,7 @@ def systems(patch: pytest.MonkeyPatch) -> Counter[str]:
                         more.setattr(factor, key, value)
                 newton = ccp.Newton(SELF, form)
                 before = {event: log.getPerfInfo()["count"] for event, log in events.items()}
-                problems = [*stored(), *heaps(4, 100, 50, mass_ratio=100.0)]
+                problems = [*stored(), *heaps(2, 100, 50, mass_ratio=100.0)]
                 solved = [
                     ccp.solve(*given, type=method, law=ccp.RELAXATION, newton=newton, limits=ccp.Limits(1e-5))
                     for given in problems
@@ -216,7 +215,7 @@ def trains(patch: pytest.MonkeyPatch) -> Counter[str]:
         apart = np.subtract(np.unravel_index(i, (32, 32)), np.unravel_index(j, (32, 32))) / 32
         return 2.0 * (i == j) + np.exp(-np.sqrt((apart**2).sum(axis=0)) / 0.3)
 
-    for seed in range(5):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         cross = tt.compress_cross(tt.EntryMatrix(entries, tt.GridDigits((32, 32))), 30, 1e-3, rng=rng)
         line = sp.diags([-1.0, 2.0 + 0.1 * rng.random(32), -1.0], [-1, 0, 1], shape=(32, 32))
@@ -238,14 +237,14 @@ def preconditioners(patch: pytest.MonkeyPatch) -> Counter[str]:
     for reuse in ("none", "cores", "trains"):
         mat = poisson(24)
         ksp = ready(mat, rank=10, reuse=reuse)
-        for shift in (0.0, 0.3, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0):
+        for shift in (0.0, 0.3, 0.0, 0.0, 1.0, 0.0, 0.0, 3.0):
             mat.shift(shift)
             steps, left = solve(ksp)
             assert left < 1e-6
             counts[f"a matrix that changes, {reuse}: steps"] += steps
         account = context(ksp).account
         counts[f"a matrix that changes, {reuse}: new trains"] = account.setups - account.kept
-    for length in (1.0, 3.0, 10.0):
+    for length in (1.0, 10.0):
         ksp = ready(from_differences(lambda s, length=length: np.exp(-np.sqrt((s**2).sum(axis=0)) / length), (24, 20)))
         counts["transforms by choice: steps"] += solve(ksp)[0]
         away = np.sqrt((np.indices((40, 40)) ** 2.0).sum(axis=0)) / (3 * length)
@@ -323,18 +322,18 @@ def calls(patch: pytest.MonkeyPatch) -> Counter[str]:
     boxes, pendulum, rest = (Scene(friction=0.5) for _ in range(3))
     for scene in (boxes, rest):
         scene.add_body("floor", [Plane((0, 0, 1))])
-    boxes.add_boxes([[0.0, 0.1 * (k % 2), 0.11 + 0.21 * k] for k in range(10)], (0.1, 0.1, 0.1), 1000.0)
+    boxes.add_boxes([[0.0, 0.1 * (k % 2), 0.101 + 0.202 * k] for k in range(10)], (0.1, 0.1, 0.1), 1000.0)
     pendulum.add_spheres([[0.5, 0.0, 0.0]], 0.1, 1000.0)
     pendulum.add_joint("pin", 0, kind="ball", anchor=(0.0, 0.0, 0.0))
     rest.add_spheres([[0.21 * k, 0.0, 0.1] for k in range(10)], 0.1, 1000.0)
     for name, scene in (("ten boxes", boxes), ("a pendulum", pendulum), ("ten balls at rest", rest)):
         with pctt.Simulation(scene, dt=0.002, say=lambda _: None) as sim:
-            sim.copy().run(steps=60)  # so that loops are compiled
+            sim.copy().run(steps=20)  # so that loops are compiled
             called: Counter[str] = Counter()
             before = sys.getprofile()
             sys.setprofile(lambda frame, event, argument, called=called: called.update((event,)))
             try:
-                sim.run(steps=60)
+                sim.run(steps=20)
             finally:
                 sys.setprofile(before)
             counts[f"{name}: functions of Python"] = called["call"]

@@ -6,7 +6,6 @@ import importlib
 import importlib.util
 import json
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -138,9 +137,9 @@ def test_the_feeder_carries_to_its_end_what_its_source_feeds():
 
 
 def test_the_wheel_drives_itself_with_its_load():
-    _, records = run("wheel", 200, scene_settling_time="0.1", scene_length="16")
-    assert np.mean(records["slip"][100:]) < 0.7
-    assert np.mean(records["pull [W]"][100:]) > 0
+    _, records = run("wheel", 100, scene_settling_time="0.1", scene_length="16")
+    assert np.mean(records["slip"][50:]) < 0.7
+    assert np.mean(records["pull [W]"][50:]) > 0
     assert records["height [m]"][-1] < records["height [m]"][0]
 
 
@@ -396,18 +395,20 @@ def test_a_block_sticks_then_slides_with_the_force_of_its_friction(block, capsys
     assert "shear / normal" in capsys.readouterr().out
 
 
-def test_the_block_says_what_it_needs():
-    hidden = "import sys; sys.modules['skfem'] = None; sys.path.insert(0, sys.argv[1]); import block"
-    done = subprocess.run([sys.executable, "-c", hidden, str(EXAMPLES)], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert done.stderr == "block.py needs scikit-fem: pip install 'pctt[examples]', or scikit-fem itself\n"
+def test_the_block_says_what_it_needs(monkeypatch):
+    monkeypatch.setitem(sys.modules, "skfem", None)
+    monkeypatch.delitem(sys.modules, "block", raising=False)
+    with pytest.raises(SystemExit, match=r"^block.py needs scikit-fem: pip install 'pctt\[examples\]', or "):
+        importlib.import_module("block")
 
 
 @pytest.mark.parametrize(("name", "n"), [("half_space", 36), ("block", 3)])
-def test_pictures_of_cone_problems(name, n, tmp_path):
+def test_pictures_of_cone_problems(name, n, tmp_path, monkeypatch):
     matplotlib = pytest.importorskip("matplotlib", reason="matplotlib is not installed (extra `figures`)")
     if name == "block":
         pytest.importorskip("skfem", reason="scikit-fem is not installed (extra `examples`)")
     matplotlib.use("agg")
-    importlib.import_module(name).main(n, str(tmp_path / "picture.png"))
+    example = importlib.import_module(name)
+    monkeypatch.setattr(example, "STEPS", 2)
+    example.main(n, str(tmp_path / "picture.png"))
     assert (tmp_path / "picture.png").stat().st_size > 10_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
+@functools.cache
 def modules():
     """The files of dem and pctt by the names of their modules."""
     found = {}
@@ -20,16 +22,29 @@ def modules():
     return found
 
 
-def imported(path):
-    """All names that a file imports: anywhere in it, also in functions and for type checkers only."""
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
-            names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+def names_in(node, when_it_runs=False):
+    """All names that a piece of code imports: anywhere in it, also in functions and for type checkers only; or those
+    alone that are imported when it runs, none for type checkers."""
+    if when_it_runs and isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+        return
+    for below in ast.iter_child_nodes(node):
+        if isinstance(below, ast.Import):
+            yield from (alias.name for alias in below.names)
+        elif isinstance(below, ast.ImportFrom):
+            assert below.level == 0, "relative import"
+            yield from (f"{below.module}.{alias.name}" for alias in below.names)
+        elif isinstance(below, ast.stmt | ast.excepthandler | ast.match_case):  # no expression imports
+            yield from names_in(below, when_it_runs)
+
+
+@functools.cache
+def tree(path):
+    return ast.parse(path.read_text())
+
+
+@functools.cache
+def imported(path, when_it_runs=False):
+    return {*names_in(tree(path), when_it_runs)}
 
 
 def longest_known(name, known):
@@ -50,23 +65,11 @@ def test_no_module_imports_itself_in_a_circle(graph):
     assert order.index("dem.model.world") < order.index("dem.contact") < order.index("dem.start")
 
 
-def at_import(tree):
-    """The names that a file imports when it runs: none for type checkers."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            continue
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        yield from at_import(node)
-
-
 @pytest.mark.parametrize(("package", "most"), [("dem", 15), ("pctt", 20), ("", 27)])
 def test_a_chain_of_imports_is_no_longer_than_it_was(package, most):
     known = {name: path for name, path in modules().items() if within(name, package or name)}
-    trees = {name: ast.parse(path.read_text()) for name, path in known.items()}
-    graph = {name: {longest_known(n, known) for n in at_import(tree)} - {None, name} for name, tree in trees.items()}
+    names = {name: imported(path, when_it_runs=True) for name, path in known.items()}
+    graph = {name: {longest_known(n, known) for n in names[name]} - {None, name} for name in known}
     floors = {}
     for name in TopologicalSorter(graph).static_order():
         floors[name] = 1 + max((floors[other] for other in graph[name]), default=0)

@@ -41,20 +41,10 @@ def test_pages_name_studies_that_there_are():
             assert (ROOT / "run" / name).exists() or (ROOT / "pctt" / "run" / name).exists(), f"{page}: run/{name}"
 
 
-QUICK = ["trains ranks 1 -caps 10 -every 12", "ranks unfoldings 1"]
-
-
-@pytest.mark.parametrize("words", QUICK)
-def test_a_study_of_the_smallest_size_runs(words, tmp_path):
-    name, *rest = words.split()
-    done = subprocess.run([sys.executable, STUDIES / f"{name}.py", *rest], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert list((tmp_path / "results").glob(f"{name}*.json"))
-
-
-#: Every other study at a small size, but those of other programs, which have to be there, and `convert_problems`, whose
+#: Every study at a small size, but those of other programs, which have to be there, and `convert_problems`, whose
 #: files tests/ccp/test_convert_problems.py has.
 SMALL = [
+    "ranks unfoldings 1", "trains ranks 1 -caps 10 -every 12",
     "trains reuse 1 -steps 2", "trains scaling 1", "measure steps 1",
     "measure preconditioners 1 -every 8 -names pbjacobi,tt", "measure laws 1", "measure paper -n 1",
     "measure pdip -n 1", "time_steps mixer4 --starts 1 --settings 6", "windows shear4 --states 1 --settings default "
@@ -72,7 +62,7 @@ DRAWS = {"structure": "matplotlib", "table_plots": "matplotlib", "pictures": "vt
 
 def test_the_small_studies_are_all():
     files = {name for name in re.findall(r"^\| `([a-z_]+)", PAGE, re.MULTILINE)}
-    assert files - ELSEWHERE == {words.split()[0] for words in QUICK + SMALL}
+    assert files - ELSEWHERE == {words.split()[0] for words in SMALL}
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ def dense(kernel, block: int) -> np.ndarray:
     return kernel(s).reshape(n, n, block, block).transpose(0, 2, 1, 3).reshape(n * block, n * block)
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize(
     ("kernel", "block", "symmetric"),
     [(even, 1, True), (oblique, 1, True), (upwind, 1, False), (stokeslet, 3, True), (mixed, 2, False)],
@@ -63,7 +63,7 @@ def test_products_and_entries_are_those_of_the_kernel(kernel, block, symmetric):
     np.testing.assert_allclose(mat.getDiagonal().array_r, np.diag(A)[first:last])
 
 
-@pytest.mark.parallel(1, 3)
+@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize(("kernel", "block"), [(even, 1), (oblique, 1), (stokeslet, 3)])
 def test_the_preconditioner_takes_it(kernel, block):
     mat = from_differences(kernel, (6, 7, 8), block)

@@ -54,7 +54,7 @@ def diagonal_mat(like: PETSc.Mat, kind: str) -> PETSc.Mat:
     return mat
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("grid", GRIDS)
 def test_arithmetic_is_that_of_matrices(grid):
     kernel, other = Kernel(grid, skew=0.3), Kernel(grid, 1.0, 20.0)
@@ -272,7 +272,7 @@ def test_the_context_of_a_mat_may_give_entries_and_grid(way):
     np.testing.assert_allclose(of(X), np.linalg.inv(Kernel((5, 6)).dense), atol=1e-8)
 
 
-@pytest.mark.parallel(1, 2, 3)
+@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.parametrize("way", ["train", "dense"])
 def test_the_inverse_solves_directly(grid, way):

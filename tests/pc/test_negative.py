@@ -41,7 +41,6 @@ def test_blocks():
     assert solve(ksp)[1] < 1e-6
 
 
-@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("rank", ["20", "auto"])
 @pytest.mark.parametrize("kind", ["shell", "dense", "train"])
 def test_minus_a_kernel(rank, kind):

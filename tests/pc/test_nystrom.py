@@ -64,7 +64,6 @@ def matrix(A: np.ndarray) -> PETSc.Mat:
     return shell(lambda i, j: A[i, j], A)
 
 
-@pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("case", CASES)
 def test_it_takes_half_of_the_iterations(case):
     A = CASES[case]() + 3e-3 * np.eye(len(CASES[case]()))

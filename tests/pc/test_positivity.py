@@ -27,12 +27,12 @@ def negative(X: np.ndarray, A: np.ndarray) -> bool:
 @pytest.mark.parallel(1, 2)
 def test_negative_directions_without_a_train_are_found():
     """X = A^-1 - factor v v' / v'A v, negative at A v: `lowest` looks only at vectors of rank 8, v has none."""
-    A, factor = laplacian(32), 1.1
+    A, factor = laplacian(24), 1.1
     for seed in range(2):
         v = A @ np.random.default_rng(seed).standard_normal(len(A))
         X = np.linalg.inv(A) - factor * np.outer(v, v) / (v @ A @ v)
         assert np.linalg.eigvalsh(X)[0] < -0.01
-        assert tt.lowest(tt.decompose_matrix(X, (32, 32))) > 0
+        assert tt.lowest(tt.decompose_matrix(X, (24, 24))) > 0
         assert negative(X, A)
         X += (factor - 0.95) * np.outer(v, v) / (v @ A @ v)
         assert not negative(X, A)
@@ -56,12 +56,11 @@ def seeded(mat: PETSc.Mat, rank: int, seed: int) -> PETSc.KSP:
     return ksp
 
 
-@pytest.mark.parametrize("max_rank", [6, 10, 20])
-def test_no_train_of_a_poisson_matrix_breaks_the_solve(max_rank):
+def test_no_train_of_a_poisson_matrix_breaks_the_solve():
     """Inverses of rank 20 of this matrix that were not positive passed as such, by the arithmetic of some processors,
     and by the seeds 1 and 2 of others."""
     for seed in range(3):
-        ksp = seeded(poisson(64), max_rank, seed)
+        ksp = seeded(poisson(64), 20, seed)
         _, residual = solve(ksp)
         assert residual < 1e-6
         assert not any("broke down" in why for why in context(ksp).account.fallbacks)
@@ -70,7 +69,7 @@ def test_no_train_of_a_poisson_matrix_breaks_the_solve(max_rank):
 def test_trains_in_use_are_positive():
     """Of ranks at which some trains are not."""
     used = 0
-    for seed, rank in product(range(3), (4, 8, 12)):
+    for seed, rank in product(range(2), (4, 8, 12)):
         ksp = seeded(poisson(16), rank, seed)
         used += context(ksp).rank > 1
         assert np.linalg.eigvalsh(operator(ksp))[0] > 0

@@ -193,7 +193,7 @@ def test_an_overflow_makes_a_new_tree():
 @pytest.mark.parallel(1, 3)
 def test_rows_that_change_ranks(ranks):
     """A grid of points, cut into slabs whose borders move; rows enter and leave every rank."""
-    comm, n = MPI.COMM_WORLD, 24
+    comm, n = MPI.COMM_WORLD, 16
     line = sp.diags([-1.0, 2.0, -1.0], [-1, 0, 1], shape=(n, n))
     A = sp.kronsum(line, line, format="csr")
 

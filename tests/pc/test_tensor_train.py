@@ -236,7 +236,7 @@ def test_it_says_what_it_was():
         assert re.fullmatch(words, context(ksp).what())
 
 
-@pytest.mark.parallel(1, 2, 3, 4)
+@pytest.mark.parallel(1, 3)
 def test_any_number_of_ranks():
     ksp = solver(poisson(20), rank=8, order="morton", reuse="trains")
     its, residual = solve(ksp)

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from program import DROP, SETTLED, SMALL, contents, database, one_line, steps_of, summary_of
+from program import DROP, SETTLED, SMALL, contents, database, one_line, steps_of
 from sealed import edited
 
 from pctt.options import OptionError
@@ -145,10 +145,8 @@ def test_a_bad_option_is_refused_before_any_work(options, results, monkeypatch):
     assert contents(results) == before
 
 
-@pytest.mark.parametrize("text", [None, "-steps 1 -dt 0.01\n"])
-def test_a_file_of_options_that_petsc_refuses_is_named(text, program, results, tmp_path):
-    if text:
-        (tmp_path / "options").write_text(text)
+def test_a_file_of_options_that_petsc_refuses_is_named(program, results, tmp_path):
+    (tmp_path / "options").write_text("-steps 1 -dt 0.01\n")
     before = contents(results)
     done = program("-options_file", "options", own=True, status=2)  # PETSc says more before
     assert done.stderr.splitlines()[-1].startswith("pctt.run: PETSc refuses -options_file")
@@ -184,9 +182,8 @@ def test_a_bad_numerical_parameter_of_a_scene_file_is_refused_before_any_work(li
 
 @pytest.mark.parallel(1, 2)
 @pytest.mark.parametrize("options", FROM_OUTSIDE)
-def test_a_bad_option_ends_the_program_with_one_line(options, ranks, program, results):
-    own = ranks == 1 and options in ("-stepss 3", "-pc_type nosuch")
-    check_words(refused(program, results, *options.split(), own=own).partition(": ")[2], options)
+def test_a_bad_option_ends_the_program_with_one_line(options, program, results):
+    check_words(refused(program, results, *options.split()).partition(": ")[2], options)
 
 
 @pytest.mark.parametrize("words", ["results", "-steps 3 results", "-quiet -steps 3 4", "- -steps 3"])
@@ -204,13 +201,9 @@ def test_values_with_blanks_are_taken_whole(program, tmp_path):
     (tmp_path / options[1]).write_text(DROP)
     program(*options, "-output", out, "-dump_problem", "two  words", ranks=2, own=True)
     assert {path.name for path in tmp_path.iterdir()} - {"__pycache__"} == {out, "two  words", options[1]}
-    (problem,) = (tmp_path / "two  words").iterdir()
-    said = refused(program, tmp_path / out, *options, "-output", out, own=True)
-    assert f"-output {out}: holds a run" in said
+    assert len(list((tmp_path / "two  words").iterdir())) == 1
     program(*options, "-output", out, "-restart", f"{out}/checkpoint.h5", own=True)
     assert len(steps_of(tmp_path / out)) == 2
-    program("-problem", problem, "-output", "solved -overwrite", "-quiet", own=True)
-    assert summary_of(tmp_path / "solved -overwrite")
 
 
 def test_what_petsc_cannot_hold_is_refused(program, results, monkeypatch):

@@ -243,7 +243,7 @@ def test_a_bed_of_liggghts_is_opened_without_a_speed():
     assert np.abs(sim.positions - given["positions"]).max() < 0.5 * given["radius"].min()
     fall = 9.81 * (scene.grains().mass * given["radius"]).sum()
     seen = []
-    sim.run(steps=40, call=lambda sim: seen.append((sim.kinetic_energy, sim.figures["worst_overlap [m]"])))
+    sim.run(steps=20, call=lambda sim: seen.append((sim.kinetic_energy, sim.figures["worst_overlap [m]"])))
     assert max(seen)[0] < 0.03 * fall
     assert max(overlap for _, overlap in seen) < 5e-3 * given["radius"].min()
 

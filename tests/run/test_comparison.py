@@ -6,7 +6,7 @@ import pytest
 from program import SETTLED, steps_of, summary_of
 
 # accurate Newton steps, so that every cone problem is solved by PDIP alone
-ACCURATE = ("-ksp_rtol", "1e-6", "-ksp_max_it", "2000", "-ccp_tol", "1e-4")
+ACCURATE = ("-ksp_rtol", "1e-6", "-ksp_max_it", "500", "-ccp_tol", "1e-3")
 
 PDIP = ("-ccp_type", "pdip")
 FACTOR = ("-pc_type", "python", "-pc_python_type", "pctt.pc.BlockICC")
@@ -14,7 +14,7 @@ TRAIN = ("-pc_type", "python", "-pc_python_type", "pctt.pc.TensorTrain")
 
 
 def compared(program, folder, *options):
-    done = program(*SETTLED, *ACCURATE, "-steps", 3, "-overwrite", *options)
+    done = program(*SETTLED, *ACCURATE, "-steps", 2, "-overwrite", *options)
     summary = summary_of(folder / "results")
     assert summary["newton_its"] == sum(line["newton_its"] for line in steps_of(folder / "results"))
     table = done.stdout.partition("preconditioner  ")[2].splitlines()
@@ -61,7 +61,7 @@ def test_without_options_the_program_is_the_demo(program, tmp_path):
 
 
 def test_fallbacks_of_a_train_reach_the_summary(program, settled, tmp_path):
-    summary, _ = compared(program, tmp_path, "-compare", "pbjacobi,tt", "-compare_tt_pc_tt_rank", "10")
+    summary, _ = compared(program, tmp_path, "-compare", "pbjacobi,tt", "-compare_tt_pc_tt_rank", "4")
     assert "pc_report" not in summary["compare"]["pbjacobi"]
     report = summary["compare"]["tt"]["pc_report"]
     assert report[0].startswith("tensor train")

@@ -5,6 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
+from pctt import compile
+
 BEYOND = """
 import gc
 from numba.core.dispatcher import Dispatcher
@@ -29,13 +33,15 @@ print(*used() - ready, sep=chr(10))
 """
 
 
+@pytest.mark.slow
 def test_first_steps_need_no_other_loops(tmp_path):
     words = [sys.executable, "-c", BEYOND]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert done.stdout == "\n"
 
 
-def test_words_are_refused():
-    done = subprocess.run([sys.executable, "-m", "pctt.compile", "-n"], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.endswith("error: unrecognized arguments: -n\n")
+def test_words_are_refused(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["pctt.compile", "-n"])
+    with pytest.raises(SystemExit, match="2"):
+        compile.main()
+    assert capsys.readouterr().err.endswith("error: unrecognized arguments: -n\n")

@@ -19,10 +19,14 @@ from pctt.run import interrupt
 from pctt.run.settings import Run
 
 OPTIONS = (*SMALL, *EVERY, "-ccp_type", "apgd", "-ccp_tol", 1e-3)
-RANKS = [1, pytest.param(2, marks=pytest.mark.mpi)]
+CASES = [
+    pytest.param(signal.SIGINT, 1, id="SIGINT-1"),
+    pytest.param(signal.SIGTERM, 2, id="SIGTERM-2", marks=pytest.mark.mpi),
+    pytest.param(signal.SIGINT, 2, id="SIGINT-2", marks=[pytest.mark.mpi, pytest.mark.slow]),
+]
 
 
-def interrupted(options, ranks, tmp_path, cache, ready, number, twice=False):
+def interrupted(options, ranks, tmp_path, cache, ready, number):
     """Start a run, wait until `ready`, and send the signal: to the program, or to the mpiexec of run/setup, or where
     there is another, to the last rank. Its exit status, and what it said to the standard error."""
     with subprocess.Popen(
@@ -41,9 +45,6 @@ def interrupted(options, ranks, tmp_path, cache, ready, number, twice=False):
         ours = ranks == 1 or Path(sys.executable).with_name("mpiexec").exists()
         target = run.pid if ours else max(python_of(run.pid))
         os.kill(target, number)
-        if twice:
-            time.sleep(0.5)
-            os.kill(target, number)
         _, said = run.communicate(timeout=120)
     return run.returncode, said
 
@@ -53,8 +54,7 @@ def _listen_to_ctrl_c():
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-@pytest.mark.parametrize("ranks", RANKS)
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize(("number", "ranks"), CASES)
 def test_an_interrupted_run_goes_on(number, ranks, program, tmp_path, cache):
     steps, dt = 400, 0.0125
     timed = number == signal.SIGTERM
@@ -86,21 +86,7 @@ def test_an_interrupted_run_goes_on(number, ranks, program, tmp_path, cache):
     assert_same_bits(out / "checkpoint.h5", tmp_path / "whole" / "checkpoint.h5")
 
 
-def test_the_same_signal_again_ends_a_run_at_once(program, tmp_path, cache):
-    """A sleeping scene: its step does not end."""
-    (tmp_path / "mine.py").write_text(
-        "import time\nfrom pctt.scenes.mixer import *\n"
-        "@dataclass(frozen=True)\nclass Sleeper(Mixer):\n"
-        "    def record(self, step):\n        open('asleep', 'w').close()\n        time.sleep(100)\n        return {}\n"
-    )
-    options = ("-scene", "mine.py", *OPTIONS, "-steps", 5)
-    status, said = interrupted(options, 1, tmp_path, cache, (tmp_path / "asleep").exists, signal.SIGINT, twice=True)
-    assert status == -signal.SIGINT
-    assert "will end after this step" in said
-    assert "interrupted" not in said
-
-
-def test_signals_end_the_program_at_once_before_its_steps_and_then_after_one(monkeypatch):
+def test_signals_end_the_program_at_once_before_its_steps_and_then_after_one(monkeypatch, capsys):
     """A terminal that goes away and the limit of processor time are as others; what Python has made is not taken."""
     before = {number: signal.getsignal(number) for number in interrupt.SIGNALS}
     monkeypatch.setattr(interrupt, "_noted", [])
@@ -116,6 +102,7 @@ def test_signals_end_the_program_at_once_before_its_steps_and_then_after_one(mon
         for number in (signal.SIGHUP, signal.SIGXCPU):
             os.kill(os.getpid(), number)
             assert signal.getsignal(number) is signal.SIG_DFL  # once more, and it ends at once
+        assert capsys.readouterr().err.count("will end after this step; the same signal again ends it at once\n") == 1
         assert interrupt._noted == [signal.SIGHUP, signal.SIGXCPU]
         assert interrupt.is_requested(MPI.COMM_SELF)
         interrupt._taken.clear()
@@ -129,16 +116,22 @@ def test_signals_end_the_program_at_once_before_its_steps_and_then_after_one(mon
             signal.signal(number, handler)
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=[pytest.mark.mpi, pytest.mark.slow])])
-def test_a_cut_settling_goes_on_where_it_was(ranks, program, tmp_path):
+@pytest.mark.parallel(1, 2)
+def test_a_cut_settling_goes_on_where_it_was(program, tmp_path, monkeypatch):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    program(*SMALL, "-settle", ranks=ranks, cache=whole)
+    (tmp_path / "short.py").write_text(
+        "from pctt.scenes.mixer import *\n@dataclass(frozen=True)\nclass Short(Mixer):\n    settling_time = 0.25\n"
+    )
+    short = ("-scene", "short.py", *SMALL)
+    program(*short, "-settle", cache=whole)
     (path,) = whole.glob("pctt/*.h5")
     unfinished = cut / "pctt" / path.name.replace(".h5", ".unfinished.h5")
-    status, said = interrupted((*SMALL, "-settle"), ranks, tmp_path, cut, unfinished.exists, signal.SIGINT)
-    assert status == 130, said
-    step = int(re.search(r"settling interrupted after step (\d+) of \d+; the same command goes on there", said)[1])
-    done = program(*SMALL, "-restart", "settled", "-steps", 0, ranks=ranks, cache=cut)
-    assert f"goes on after step {step}, from {unfinished}" in done.stdout
+    asked = iter([False] * 4 + [True])
+    with monkeypatch.context() as patch:
+        patch.setattr(interrupt, "is_requested", lambda comm: next(asked))
+        said = program(*short, "-settle", status=130, cache=cut).stderr
+    assert re.search(r"settling interrupted after step 5 of \d+; the same command goes on there", said)
+    done = program(*short, "-restart", "settled", "-steps", 0, cache=cut)
+    assert f"goes on after step 5, from {unfinished}" in done.stdout
     assert not unfinished.exists()
     assert_same_bits(path, cut / "pctt" / path.name)

@@ -62,7 +62,7 @@ RUNS = [
 @pytest.mark.parametrize(
     ("ranks", "runs", "steps", "bound"),
     [
-        (2, RUNS[:1], STEPS, 2.0),
+        (1, RUNS[:1], STEPS, 2.0),
         pytest.param(1, RUNS, 500, 5.0, marks=pytest.mark.slow),
         pytest.param(2, RUNS, 500, 5.0, marks=pytest.mark.slow),
     ],

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-from mpi4py import MPI
 from program import assert_same_bits
 
 from pctt.folder import Folder
@@ -14,12 +12,10 @@ DRUM = ("-scene", "drum", "-scene_n", 4, "-scene_length", 2, "-scene_fill", 0.15
 DRUM = (*DRUM, "-output_every", 1)
 
 
-@pytest.mark.parallel(1, 2)
 def test_a_drum_runs_goes_on_and_is_written(program, tmp_path):
-    program(*DRUM, "-steps", 6, "-output", "whole", "-dump_problem", "problems")
-    program(*DRUM, "-steps", 3, "-output", "parts")
-    program(*DRUM, "-steps", 3, "-output", "parts", "-restart", "parts/checkpoint.h5")
-    MPI.COMM_WORLD.Barrier()
+    program(*DRUM, "-steps", 4, "-output", "whole", "-dump_problem", "problems")
+    program(*DRUM, "-steps", 2, "-output", "parts")
+    program(*DRUM, "-steps", 2, "-output", "parts", "-restart", "parts/checkpoint.h5")
     for name in ("state.h5", "checkpoint.h5"):
         assert_same_bits(tmp_path / "whole" / name, tmp_path / "parts" / name)
     folder = Folder(tmp_path / "whole")
@@ -28,9 +24,7 @@ def test_a_drum_runs_goes_on_and_is_written(program, tmp_path):
     assert [shape["kind"] for shape in drum["shapes"] + ends["shapes"]] == ["Mesh"] * 3
     assert np.shape(drum["shapes"][0]["vertices"]) == (2 * Drum.sides, 3)
     assert np.shape(drum["shapes"][0]["triangles"]) == (2 * Drum.sides, 3)
-    assert (folder.frame(6).contacts.bodies >= folder.grains).any()
+    assert (folder.frame(4).contacts.bodies >= folder.grains).any()
     files = sorted(path.name for path in (tmp_path / "problems").iterdir())
     assert files
-    if MPI.COMM_WORLD.size == 1:
-        file = next(path for path in (tmp_path / "problems").iterdir() if path.suffix in (".hdf5", ".h5"))
-        program("-problem", file, "-ccp_type", "apgd", "-output", "solved")
+    program("-problem", f"problems/{files[0]}", "-ccp_type", "apgd", "-output", "solved")

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
-import os
-import pty
 import re
-import subprocess
+import sys
 
 import h5py
 import numpy as np
 import pytest
-from program import SETTLED, SMALL, arrays, command, environment, steps_of, summary_of
+from program import SETTLED, SMALL, arrays, database, simulated, steps_of, summary_of
 
 from pctt.scenes import Mixer
 
@@ -162,27 +161,19 @@ def test_lines_are_plain_where_there_is_no_terminal(program, settled):
     assert int(first[0]) > 90
 
 
-def test_on_a_terminal_the_present_step_is_shown(settled, cache, tmp_path):
-    inner, outer = pty.openpty()
-    words = command(*SETTLED, "-steps", 2, "-ccp_type", "apgd")
-    with subprocess.Popen(words, cwd=tmp_path, env=environment(cache), stdout=outer, stderr=outer) as run:
-        os.close(outer)
-        said = b""
-        while True:
-            try:
-                part = os.read(inner, 4096)
-            except OSError:  # the other end is closed
-                break
-            if not part:
-                break
-            said += part
-    os.close(inner)
-    assert run.returncode == 0
-    first = int(arrays(settled)["world/step"]) + 1
-    assert f"step {first}, time".encode() in said
-    assert b"\r\033[K" in said
-    assert b"(2 of 2)" in said
-    assert re.search(rb"about \d+ s left", said)
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_on_a_terminal_the_present_step_is_shown(settled, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "stdout", terminal := Terminal())
+    simulated(database([*SMALL, "-restart", str(settled), "-steps", "2", "-ccp_type", "apgd"]))
+    first, said = int(arrays(settled)["world/step"]) + 1, terminal.getvalue()
+    assert f"\r\033[Kstep {first}, time" in said
+    assert "(2 of 2)" in said
+    assert re.search(r"about \d+ s left", said)
 
 
 def test_a_quiet_run_says_nothing_but_errors(program, settled, tmp_path):

@@ -33,7 +33,7 @@ def test_the_tables_count_and_name_failures():
 
 
 @pytest.mark.parametrize(
-    ("law", "solver"), [("convex", "conic"), ("convex", "apgd"), ("coulomb", "apgd"), ("coulomb", "pdip")]
+    ("law", "solver"), [("convex", "conic"), ("convex", "apgd"), ("coulomb", "apgd")]
 )
 def test_a_problem_of_a_folder_is_solved_to_every_tolerance(tmp_path, law, solver):
     (tmp_path / "good.dat").write_text(SLIDES)

@@ -245,28 +245,26 @@ def test_the_options_of_petsc_stay_as_they_are(solver, tmp_path):
 
 
 PLAIN = """
-import sys
+import sys, pctt
+assert not any("petsc4py" in name or "numpy" in name for name in sys.modules), "slow"
+import petsc4py
+petsc4py.init(["", "-my_option", "3"])
+pctt.Simulation
+from petsc4py import PETSc
+assert PETSc.Options().getInt("my_option") == 3
 from pctt.scenes import Mixer
 from pctt.run import help, simulate
-from pctt.simulation import Simulation
-Simulation(Mixer(n=1), solver="apgd").run(steps=1)
+pctt.Simulation(Mixer(n=1), solver="apgd").run(steps=1)
 print(*sys.modules)
 """
 
 
 def test_a_plain_run_does_not_load_what_it_does_not_use():
-    """On a cluster every rank opens the file of every module."""
+    """On a cluster every rank opens the file of every module. To import the package starts no PETSc."""
     said = subprocess.run([sys.executable, "-c", PLAIN], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = set(said.stdout.split())
     assert "dem.contact" in loaded
     assert not loaded & {"pctt.tt", "pctt.mat", "pctt.pc", "matplotlib", "vtk", "scipy.fft", "scipy.signal"}
-
-
-def test_to_import_the_package_starts_no_petsc():
-    words = "import sys, pctt; assert not any('petsc4py' in name or 'numpy' in name for name in sys.modules), 'slow'"
-    words += "; import petsc4py; petsc4py.init(['', '-my_option', '3']); pctt.Simulation; from petsc4py import PETSc"
-    words += "; assert PETSc.Options().getInt('my_option') == 3"
-    subprocess.run([sys.executable, "-c", words], check=True, cwd=ROOT)
 
 
 @pytest.mark.parametrize(

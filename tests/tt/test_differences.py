@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pctt.tt import differences as of
 from pctt.tt.conjugate import ConjugateGradients, iterations, race
 
-SHAPES = st.lists(st.integers(1, 6), min_size=1, max_size=3).map(tuple)
+SHAPES = st.lists(st.integers(1, 6), min_size=1, max_size=3).map(tuple).filter(lambda shape: np.prod(shape) <= 36)
 
 
 def basis(n: int, kind: str) -> np.ndarray:
@@ -115,7 +115,7 @@ KERNELS = {
     "exponential": np.exp(-np.hypot(x, y) / 10), "turned": np.exp(-turned), "turned Gauss": np.exp(-(turned**2)),
     "waves": np.cos(0.5 * x) * np.cos(0.5 * y), "season": np.exp(-abs(x) / 8 - 2 * np.sin(np.pi * y / 8) ** 2),
     "periodic": np.exp(-np.minimum(abs(x), 96 - abs(x)) / 5 - np.minimum(abs(y), 80 - abs(y)) / 9),
-    "band": np.sinc(0.2 * x) * np.sinc(0.15 * y), "moving": np.exp(-np.hypot((x - 0.8 * y) / 6, y / 12)),
+    "moving": np.exp(-np.hypot((x - 0.8 * y) / 6, y / 12)),
 }  # fmt: skip
 
 
@@ -126,8 +126,6 @@ def test_the_choice_and_its_trials_cost_no_more_than_nothing_and_a_circulant(nam
     found = of.choose(a)
     chosen, alone, circulant = (count(a, kind) for kind in (found.kind, of.NOTHING, of.CIRCULANT))
     assert chosen <= 1.3 * min(alone, circulant)
-    if name == "band":  # a tie: a cosine transform takes 164 iterations, none 168
-        return
     assert found.cost_estimate.spent + chosen * (2 if found.kind else 1) <= 1.3 * min(alone, 2 * circulant) + 1
     if name == "exponential":
         assert chosen <= 0.4 * circulant
@@ -148,7 +146,7 @@ def test_means_over_cells_are_those_of_the_matrix(shape, block, even, seed) -> N
 @pytest.mark.parametrize("strength", [1000.0, 2500.0])
 def test_parts_of_an_equation_of_the_second_kind_do_not_show_all_of_it(strength) -> None:
     """Of I + h^3 K: a part of few points is near I, and conjugate gradients alone would seem good enough."""
-    n = 60
+    n = 30
     r = np.sqrt((offsets(n, n, n) ** 2).sum(axis=0)) / n
     near = np.where(r > 0, 1 / np.maximum(r, 1 / n), 2.38 * n)
     a = kernel(strength / (4 * np.pi) / n**3 * np.exp(-10 * r) * near, 1.0)
@@ -185,7 +183,7 @@ def test_parts_show_a_function_of_one_coordinate() -> None:
 
 
 SEASONS = {  # shape, period along the last axis, and correlation lengths along both
-    "nearly of the grid": ((24, 122), 30.4, (8, inf)), "not of the grid": ((40, 200), 29.53, (8, inf)),
+    "nearly of the grid": ((24, 122), 30.4, (8, inf)), "not of the grid": ((24, 130), 29.53, (8, inf)),
     "damped": ((24, 122), 30.4, (8, 90)), "longer than the grid": ((30, 90), 95.0, (5, inf)),
     "short": ((40, 140), 7.02, (8, inf)),
 }  # fmt: skip

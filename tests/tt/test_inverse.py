@@ -11,9 +11,6 @@ from matrices import laplacian, positive
 
 from pctt import tt
 from pctt.tt import inverse
-from pctt.tt.inverse import invert_near_identity
-from pctt.tt.train import decompose_matrix
-from pctt.tt.work import Work
 
 
 def exact(dense: np.ndarray, modes: tuple[int, ...]) -> tt.Train:
@@ -21,7 +18,7 @@ def exact(dense: np.ndarray, modes: tuple[int, ...]) -> tt.Train:
 
 
 @given(seed=st.integers(0, 2**32 - 1), b=st.sampled_from([1, 3]), modes=st.sampled_from([(3, 4), (2, 2, 3), (12,)]))
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_full_rank_inverse_is_exact(seed: int, b: int, modes: tuple[int, ...]) -> None:
     dense = positive(np.random.default_rng(seed), 12, b).dense()
     S = exact(dense, tt.scalar_modes(modes, b))
@@ -32,7 +29,7 @@ def test_full_rank_inverse_is_exact(seed: int, b: int, modes: tuple[int, ...]) -
 
 
 @given(seed=st.integers(0, 2**32 - 1), rank=st.integers(1, 12))
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_residual_and_symmetry(seed: int, rank: int) -> None:
     dense = positive(np.random.default_rng(seed), 36, 2).dense()
     S = exact(dense, (3, 4, 6))
@@ -56,7 +53,7 @@ def laplacian_and_one(n: int, dimensions: int) -> np.ndarray:
     return A.toarray() + np.eye(n**dimensions) / n
 
 
-@pytest.mark.parametrize(("n", "dimensions", "eps"), [(32, 2, 1e-2), (32, 2, 1e-4), (8, 3, 1e-3)])
+@pytest.mark.parametrize(("n", "dimensions", "eps"), [(16, 2, 1e-2), (16, 2, 1e-4), (8, 3, 1e-3)])
 def test_ranks_grow_until_the_residual_is_small_enough(n: int, dimensions: int, eps: float) -> None:
     dense = laplacian_and_one(n, dimensions)
     S = exact(dense, (2,) * round(np.log2(len(dense))))
@@ -99,7 +96,7 @@ def test_indefinite_matrices_are_reported() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_lowest_eigenvalue_is_bounded_from_above(seed: int) -> None:
     X = tt.random([3, 4, 5], 3, [3, 4, 5], np.random.default_rng(seed))
     X = X + X.T
@@ -112,10 +109,10 @@ def test_lowest_eigenvalue_is_bounded_from_above(seed: int) -> None:
 
 def test_lowest_finds_what_vectors_of_rank_two_do_not_see() -> None:
     """A negative direction of rank 8 among positive ones: an inverse that is a little wrong."""
-    v = tt.random((2,) * 10, 8, rng=np.random.default_rng(0)).full().ravel()
+    v = tt.random((2,) * 8, 8, rng=np.random.default_rng(0)).full().ravel()
     v /= np.linalg.norm(v)
-    dense = np.linalg.inv(laplacian_and_one(32, 2))
-    X = exact(dense - 1.5 * (v @ dense @ v) * np.outer(v, v), (2,) * 10)
+    dense = np.linalg.inv(laplacian_and_one(16, 2))
+    X = exact(dense - 1.5 * (v @ dense @ v) * np.outer(v, v), (2,) * 8)
     least = np.linalg.eigvalsh(X.full())[0]
     assert least < 0
     assert tt.lowest(X) == pytest.approx(least, rel=0.1)
@@ -127,12 +124,3 @@ def test_residual_of_high_ranks_is_estimated(monkeypatch: pytest.MonkeyPatch) ->
     measured = tt.residual(S, X)
     monkeypatch.setattr(inverse, "HIGH", 0)
     assert tt.residual(S, X) == pytest.approx(measured, rel=0.5)
-
-
-def test_within_a_limit_of_operations_a_higher_rank_is_not_worse():
-    """The ranks do not grow beyond what later passes can make use of."""
-    size = np.arange(900)
-    A = 1 / (1 + np.add.outer(size, size)) + 1e-3 * np.eye(900)
-    T = decompose_matrix(A / np.diag(A).mean() - np.eye(900), [2, 2, 3, 3, 5, 5], eps=1e-4)
-    left = [invert_near_identity(T, rank, eps=1e-3, work=Work(5e8)).residual for rank in (20, 100)]
-    assert left[1] <= left[0]
