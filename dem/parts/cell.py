@@ -57,7 +57,7 @@ class Cell(Named):
         return bool(self.axes.any())
 
     @property
-    def _lengths(self) -> Floats:
+    def lengths(self) -> Floats:
         """The periods (3,); 0: none [m]."""
         return np.where(self.axes, self.period, 0.0)
 
@@ -90,7 +90,7 @@ class Cell(Named):
         out = position.copy()
         if self.gradient is not None:
             out[:, 0] -= self._crossed(position) * self.shift
-        out -= self._lengths * np.floor(out / self.period)
+        out -= self.lengths * np.floor(out / self.period)
         out[out >= self.period] = 0.0  # a negative number that rounding makes a whole period
         return out
 
@@ -126,7 +126,7 @@ class Cell(Named):
 
     def whole(self, vector: Floats) -> Floats:
         """The part (..., 3) of ways (..., 3) that is whole periods [m]; without it, ways lead to the nearest image."""
-        return self._lengths * np.round(vector / self.period) if self.periodic else np.zeros(vector.shape)
+        return self.lengths * np.round(vector / self.period) if self.periodic else np.zeros(vector.shape)
 
     def images(self) -> tuple[Floats, Floats]:
         """By how many periods (k, 3) a body and its images about the cell are moved, and how many sheared boundaries
@@ -151,7 +151,7 @@ class Cell(Named):
 
     def moved(self, steps: Floats, across: Floats) -> Floats:
         """The ways (k, 3) by so many periods (k, 3) and over so many sheared boundaries (k,) [m]."""
-        vector = steps * self._lengths
+        vector = steps * self.lengths
         vector[:, 0] += across * self.shift
         return vector
 
@@ -159,7 +159,7 @@ class Cell(Named):
     def lattice(self) -> tuple[Floats, Floats]:
         """The ways (3, 3) to the next images along each axis [m], and their velocities (3, 3) [m/s]; zeros along axes
         without a period. Sheared images are the nearest along x."""
-        vectors, drift = np.diag(self._lengths), np.zeros((3, 3))
+        vectors, drift = np.diag(self.lengths), np.zeros((3, 3))
         if self.gradient is not None:
             vectors[self.gradient, 0] = self.shift - self.period[0] * np.round(self.shift / self.period[0])
             drift[self.gradient, 0] = self.speed

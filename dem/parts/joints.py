@@ -24,52 +24,65 @@ if TYPE_CHECKING:
     from dem.parts.cell import Cell
 
 
-def axes_of(frame: Floats) -> Floats:
-    """The axes (n, 3, 3) of frames of quaternions (n, 4), as rows in the world."""
-    return quaternion.matrix(frame).transpose(0, 2, 1)
-
-
-def turned(one: Floats, other: Floats, relative: Floats) -> tuple[Floats, Floats]:
-    """The frames (n, 4) of whose axes a joint holds some, and the turns (n, 3) about them [rad], of joints with these
-    frames (n, 4) in their bodies, and the turn `relative` (n, 4) from one to the other: the rotation vector."""
-    sine = quaternion.length(relative[:, 1:])
-    angle = 2.0 * np.arctan2(sine, relative[:, 0])
-    return one, relative[:, 1:] * np.divide(angle, sine, out=np.full(len(sine), 2.0), where=sine > 1e-12)[:, None]
-
-
-def turned_about_z(one: Floats, other: Floats, relative: Floats) -> tuple[Floats, Floats]:
-    """As `turned`: the tilt of the z axis, and the angle about it."""
-    z = np.einsum("nij,nj->ni", axes_of(one), quaternion.rotate(other, np.array([0.0, 0.0, 1.0])))
-    return one, np.stack([-z[:, 1], z[:, 0], 2.0 * np.arctan2(relative[:, 3], relative[:, 0])], axis=1)
-
-
-def turned_about_pins(one: Floats, other: Floats, relative: Floats) -> tuple[Floats, Floats]:
-    """As `turned`, with two pins, the z axis of the first body and the x axis of the second: the frame of the cross of
-    both, and the Cardan angles, of the cross about the first pin, between the pins, and about the second pin."""
-    turn = quaternion.matrix(relative)
-    angle = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
-    about = np.stack([np.cos(0.5 * angle), 0.0 * angle, 0.0 * angle, np.sin(0.5 * angle)], axis=1)
-    between = -np.arcsin(np.clip(turn[:, 2, 0], -1.0, 1.0))
-    angles = np.stack([np.arctan2(turn[:, 2, 1], turn[:, 2, 2]), between, angle], axis=1)
-    return quaternion.multiply(one, about), angles
+#: What turns of a joint are, see `placed`: a rotation vector, a tilt and an angle about z, Cardan angles of two pins.
+VECTOR, ABOUT_Z, ABOUT_PINS = range(3)
 
 
 @loop
-def sides(orientation: Floats, anchors: Floats, frames: Floats) -> tuple[Floats, Floats, Floats]:
-    """Of joints with anchors (n, 2, 3) and frames (n, 2, 4) in bodies of these orientations (n, 2, 4) the arms
-    (n, 2, 3), the frames (n, 2, 4) in the world, and the turns (n, 4) from the first to the second."""
-    arms, turns, relative = np.empty(anchors.shape), np.empty(frames.shape), np.empty((len(frames), 4))
-    for n in range(len(frames)):
+def placed(turns, anchors, frames, place, orientation, period):
+    """`Geometry` of joints whose turns are of these kinds (n,), with anchors (n, 2, 3) and frames (n, 2, 4) in bodies
+    of these places (n, 2, 3) and orientations (n, 2, 4), in a cell of this period (3,), 0: none.
+
+    The turns are those of the second frame as seen from the first, whose axes a joint holds: the rotation vector; the
+    tilt of the z axis, and the angle about it; or with two pins, the z axis of the first body and the x axis of the
+    second, the Cardan angles, of the cross of both about the first pin, between the pins, and about the second pin. Then
+    the axes are those of the cross."""
+    arms, error, axes = np.empty(anchors.shape), np.empty((len(turns), 6)), np.empty((len(turns), 3, 3))
+    frame, relative, cross = np.empty((2, 4)), np.empty(4), np.empty(4)
+    for n in range(len(turns)):
         for k in range(2):
             q, at = orientation[n, k], anchors[n, k]
             arm = vectors.turned((at[0], at[1], at[2]), (q[1], q[2], q[3]), 2.0 * q[0], 2.0)
             arms[n, k, 0], arms[n, k, 1], arms[n, k, 2] = arm
-            _set_product(q, 1.0, frames[n, k], turns[n, k])
-        _set_product(turns[n, 0], -1.0, turns[n, 1], relative[n])
-        if relative[n, 0] < 0.0:
-            for k in range(4):
-                relative[n, k] = -relative[n, k]
-    return arms, turns, relative
+            _set_product(q, 1.0, frames[n, k], frame[k])
+        _set_product(frame[0], -1.0, frame[1], relative)
+        sign = -1.0 if relative[0] < 0.0 else 1.0
+        w, x, y, z = sign * relative[0], sign * relative[1], sign * relative[2], sign * relative[3]
+        own = frame[0]
+        if turns[n] == VECTOR:
+            sine = np.sqrt(x * x + y * y + z * z)
+            share = 2.0 * np.arctan2(sine, w) / sine if sine > 1e-12 else 2.0
+            error[n, 3], error[n, 4], error[n, 5] = share * x, share * y, share * z
+        elif turns[n] == ABOUT_Z:
+            error[n, 3], error[n, 4] = 2.0 * (w * x - y * z), 2.0 * (w * y + x * z)
+            error[n, 5] = 2.0 * np.arctan2(z, w)
+        else:
+            angle = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+            error[n, 3] = np.arctan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+            error[n, 4] = -np.arcsin(min(max(2.0 * (x * z - w * y), -1.0), 1.0))
+            error[n, 5] = angle
+            relative[0], relative[1], relative[2], relative[3] = np.cos(0.5 * angle), 0.0, 0.0, np.sin(0.5 * angle)
+            _set_product(own, 1.0, relative, cross)
+            own = cross
+        _set_axes(own, axes[n])
+        for i in range(3):
+            d = (place[n, 1, i] + arms[n, 1, i]) - (place[n, 0, i] + arms[n, 0, i])
+            image = period[i] * np.round(d / period[i]) if period[i] > 0.0 else 0.0
+            arms[n, 0, i] += d - image
+            relative[i] = d - image
+        for i in range(3):
+            error[n, i] = axes[n, i, 0] * relative[0] + axes[n, i, 1] * relative[1] + axes[n, i, 2] * relative[2]
+    return arms, error, axes
+
+
+@inlined
+def _set_axes(q, out):
+    """The axes (3, 3) of a frame, as rows in the world."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    out[0, 0], out[1, 1], out[2, 2] = 1 - 2 * (y * y + z * z), 1 - 2 * (x * x + z * z), 1 - 2 * (x * x + y * y)
+    out[1, 0], out[0, 1] = 2 * (x * y - w * z), 2 * (x * y + w * z)
+    out[2, 0], out[0, 2] = 2 * (x * z + w * y), 2 * (x * z - w * y)
+    out[2, 1], out[1, 2] = 2 * (y * z - w * x), 2 * (y * z + w * x)
 
 
 @inlined
@@ -88,16 +101,16 @@ class Kind(NamedTuple):
     holds: tuple[bool, ...]  #: which of three translations and three turns, along the axes of the joint; z is the axis
     coordinate: int = 5  #: the number of its free coordinate among these, that of motors and limits
     motor: bool = False  #: whether it may have them
-    turned: Callable[[Floats, Floats, Floats], tuple[Floats, Floats]] = turned
+    turns: int = VECTOR  #: what its turns are
     axes: int = 1  #: that a user gives; of two the second one is the x axis
 
 
 KINDS = {
-    "hinge": Kind((True, True, True, True, True, False), motor=True, turned=turned_about_z),
+    "hinge": Kind((True, True, True, True, True, False), motor=True, turns=ABOUT_Z),
     "slider": Kind((True, True, False, True, True, True), coordinate=2, motor=True),
     "ball": Kind((True, True, True, False, False, False)),
     "fixed": Kind((True,) * 6),
-    "universal": Kind((True, True, True, False, True, False), turned=turned_about_pins, axes=2),
+    "universal": Kind((True, True, True, False, True, False), turns=ABOUT_PINS, axes=2),
 }
 
 
@@ -224,20 +237,9 @@ class Joint(Constraint):
     @classmethod
     def geometry(cls, members: Sequence[Any], row: Ints, cell: Cell) -> Place:
         anchors, frames = (np.array([getattr(joint, name) for joint in members]) for name in ("anchors", "frames"))
-        kinds = np.array([joint.kind for joint in members])
-        of_kind = [(KINDS[kind], (kinds == kind).nonzero()[0]) for kind in dict.fromkeys(kinds.tolist())]
+        turns, period = np.array([KINDS[joint.kind].turns for joint in members]), cell.lengths
 
         def now(position: Floats, orientation: Floats) -> Geometry:
-            center, (arms, turn, relative) = position[row], sides(orientation[row], anchors, frames)
-            place = center + arms
-            frame, turns = np.empty((len(row), 4)), np.empty((len(row), 3))
-            for kind, own in of_kind:
-                frame[own], turns[own] = kind.turned(turn[own, 0], turn[own, 1], relative[own])
-            axes, d = axes_of(frame), place[:, 1] - place[:, 0]
-            image = cell.whole(d)
-            d -= image
-            arms = place[:, 1:] - center
-            arms[:, 0] -= image
-            return Geometry(arms, np.concatenate([np.einsum("nij,nj->ni", axes, d), turns], axis=1), axes)
+            return Geometry(*placed(turns, anchors, frames, position[row], orientation[row], period))
 
         return now
