@@ -15,7 +15,7 @@ from dem.bodies import COMPOUND
 from dem.contact import find_contacts
 from dem.experiment import Experiment
 from dem.model.partition import rebalance
-from dem.motion import Glide, Guided, Hinged
+from dem.motion import Glide, Guided, Hinged, Oscillation
 from dem.record.energies import energy
 from dem.scene import Scene
 from dem.shapes import Plane, Sphere
@@ -23,6 +23,7 @@ from dem.start import new_world
 from dem.step import Step, advance
 from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
+from pctt import Simulation
 
 SELF = MPI.COMM_SELF
 DT = 0.01
@@ -80,6 +81,22 @@ def test_a_moving_floor_does_work_through_friction():
     np.testing.assert_allclose(step.force_on("floor")[:3], [-pull / DT, 0, 0], atol=1e-9)
     np.testing.assert_allclose(step.velocity("floor"), [2.0, 0, 0, 0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(step.position("floor"), [2.0 * DT, 0, 0], atol=1e-12)
+
+
+def test_a_plate_that_shakes_does_no_work_in_a_cycle_on_what_sits_on_it():
+    """Next to the greatest kinetic energy, at the default step."""
+    swing, period = 0.005, 0.2
+    scene = Scene(0.3)
+    scene.add_spheres([0, 0, 0.01], 0.01, 2500.0)
+    scene.add_body("plate", [Plane((0, 0, 1))], Oscillation((0, 0, 1), swing, period))
+    sim = Simulation(scene, comm=SELF)
+    work, lost = np.zeros((2, 2 * round(period / sim.settings.dt)))
+    for n in range(len(work)):
+        sim.step()
+        work[n], lost[n] = sim.figures["work_of_motions [J]"], sim.figures["impact_loss [J]"]
+    kinetic = 0.5 * sim.local.mass[0] * (2.0 * np.pi * swing / period) ** 2
+    cycle = slice(len(work) // 2, None)
+    assert max(abs(work[cycle].sum()), abs(lost[cycle].sum())) < 0.05 * kinetic
 
 
 @pytest.mark.parametrize(
