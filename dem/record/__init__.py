@@ -111,11 +111,12 @@ def energy_balance(step: Step) -> dict[str, float]:
                                                  + time stepping
 
     With g the impulses and w the mean of the velocities before and after (of prescribed motions in the first step: that
-    of the step), the impulses do the work g' D' w: what sits on a plate that shakes gets from it what it has. What its tangential part does not give to the springs of contacts is the friction
-    loss. What its normal part does not is lost in impacts, or pushes overlaps of rigid contacts apart where it is a
-    gain. The work of motions is that of prescribed bodies on the others, of the drives of guided and hinged bodies, of
-    what holds bodies in part, of belts, of parts and of the shear of a cell. The rest is the error of the semi-
-    implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
+    of the step), the impulses do the work g' D' w: what sits on a plate that shakes gets from it what it has. What its
+    tangential part does not give to the springs of contacts is the friction loss. What its normal part does not is lost
+    in impacts, or pushes overlaps of rigid contacts apart where it is a gain. The work of motions is that of prescribed
+    bodies on the others, of the drives of guided and hinged bodies, of what holds bodies in part, of belts, of parts
+    and of the shear of a cell. The rest is the error of the semi-implicit step, of the order of dt:
+    -dt/2 m g (v_new - v_old) per body.
 
     Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be, but hold
     no more than impulses have loaded them with (`dem.start.stiffness.elastic_energies`). What they lose or gain
