@@ -110,7 +110,9 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     A, flat, expected, on = B @ B.T, J.reshape(len(t), -1), push.ravel(), kind <= MOTOR
     inverse = _inverse(A, on)
     g = _impulses(A, inverse, t, flat @ ends.free.ravel() + B @ expected, on, np.zeros(len(t)))
-    swings = _swings(ends, _stiffness(ends, found, which, coordinates, g / dt), B, inverse, dt)
+    force = np.zeros((len(every), 6))
+    np.add.at(force, (which, coordinates), g / dt)
+    swings = _swings(ends, found.arms, np.einsum("ni,nij->nj", force[:, :3], found.axes), B, inverse, dt)
     if more := len(swings):
         flat = np.concatenate([flat, swings])
         B = np.concatenate([B, np.matmul(swings.reshape(more, count, 1, 6), root).reshape(more, -1)])
@@ -204,37 +206,33 @@ def refound(known: Coupling, push: Floats) -> Coupling | None:
     )
 
 
-def _stiffness(ends: Ends, found: Geometry, which: Ints, coordinates: Ints, force: Floats) -> Floats:
-    """The torques K (n, 3, 3) [N m] with which bodies that turn by an angle swing back, as the `force` (k,) of rows of
-    constraints [N] turns with no body: r x f has K = (r f) I - (r f' + f r') / 2, that of a pendulum."""
-    along = coordinates < 3
-    on_second = np.zeros((len(found.axes), 3))
-    np.add.at(on_second, which[along], force[along, None] * found.axes[which[along], coordinates[along]])
-    K = np.zeros((len(ends.free), 3, 3))
-    for side, sign in ((0, -1.0), (1, 1.0)):
-        np.add.at(K, ends.row[:, side], sign * found.arms[:, side, :, None] * on_second[:, None])
-    return np.trace(K, axis1=1, axis2=2)[:, None, None] * np.eye(3) - 0.5 * (K + K.transpose(0, 2, 1))
-
-
-def _swings(ends: Ends, stiffness: Floats, B: Floats, inverse: Floats, dt: float) -> Floats:
+def _swings(ends: Ends, arms: Floats, force: Floats, B: Floats, inverse: Floats, dt: float) -> Floats:
     """Rows a (m, 6 n) of velocities, by which bodies get the inertia a' a beside their own: that of swings which a step
     does not resolve, as those of links of a light chain with a heavy load.
 
-    The step is explicit in the `stiffness` K (n, 3, 3), and stable while w dt < 2. With the inertia dt^2 / 4 K it is
-    Newmark's with the mean acceleration, stable and without loss whatever dt is; twice that is, too, and for a K twice
-    as large as foreseen. Those swings get it that are faster than `SWING`, as the bodies move with constraints of rows
-    B with their `_inverse`.
+    The `force` (constraints, 3) on the second ends [N] turns with no body, the `arms` (constraints, 2, 3) do. So the
+    torque r x f swings a body back with the stiffness K = (r f) I - (r f' + f r') / 2, as that of a pendulum. The step
+    is explicit in it, and stable while w dt < 2. With the inertia dt^2 / 4 K it is Newmark's with the mean
+    acceleration, stable and without loss whatever dt is; twice that is, too, and for a K twice as large as foreseen.
+    Those swings get it that are faster than `SWING`, as the bodies move with constraints of rows B with their
+    `_inverse`.
     Source: Andrews, Teichmann, Kry, "Geometric stiffness for real-time constrained multibody dynamics", Computer
     Graphics Forum 36 (2017)."""
-    value, vector = np.linalg.eigh(0.5 * dt**2 * stiffness)
-    along = np.sqrt(np.clip(value, 0.0, None))[:, :, None] * vector.transpose(0, 2, 1)
-    scaled = along @ ends.root[:, 3:, 3:]
-    fast = ((scaled**2).sum(axis=(1, 2)) > SWING).nonzero()[0]
+    count, turning = len(ends.free), ends.root[:, 3:, 3:]
+    torque = quaternion.length(arms) * quaternion.length(force)[:, None]
+    most = np.bincount(ends.row.ravel(), torque.ravel(), count) * (turning**2).sum(axis=(1, 2))
+    fast = (0.5 * dt**2 * most > SWING).nonzero()[0]
     if not len(fast):
         return np.zeros((0, B.shape[1]))
-    rows, C = np.zeros((2, len(fast), 3, len(scaled), 6))
-    rows[np.arange(len(fast)), :, fast, 3:] = along[fast]
-    C[np.arange(len(fast)), :, fast, 3:] = scaled[fast]
+    K = np.zeros((count, 3, 3))
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        np.add.at(K, ends.row[:, side], sign * arms[:, side, :, None] * force[:, None])
+    K = np.trace(K, axis1=1, axis2=2)[:, None, None] * np.eye(3) - 0.5 * (K + K.transpose(0, 2, 1))
+    value, vector = np.linalg.eigh(0.5 * dt**2 * K[fast])
+    along = np.sqrt(np.clip(value, 0.0, None))[:, :, None] * vector.transpose(0, 2, 1)
+    rows, C = np.zeros((2, len(fast), 3, count, 6))
+    rows[np.arange(len(fast)), :, fast, 3:] = along
+    C[np.arange(len(fast)), :, fast, 3:] = along @ turning[fast]
     rows, C = rows.reshape(3 * len(fast), -1), C.reshape(3 * len(fast), -1)
     across = C @ B.T
     size, mode = np.linalg.eigh(C @ C.T - across @ inverse @ across.T)
