@@ -110,12 +110,13 @@ def energy_balance(step: Step) -> dict[str, float]:
         change of kinetic + potential + spring = work of motions and of cohesion - friction loss - impact loss
                                                  + time stepping
 
-    With g the impulses and w the mean of the velocities before and after (of prescribed motions: that of the step), the
-    impulses do the work g' D' w. What its tangential part does not give to the springs of contacts is the friction
-    loss. What its normal part does not is lost in impacts, or pushes overlaps of rigid contacts apart where it is a
-    gain. The work of motions is that of prescribed bodies on the others, of the drives of guided and hinged bodies, of
-    what holds bodies in part, of belts, of parts and of the shear of a cell. The rest is the error of the semi-
-    implicit step, of the order of dt: -dt/2 m g (v_new - v_old) per body.
+    With g the impulses and w the mean of the velocities before and after (of prescribed motions in the first step: that
+    of the step), the impulses do the work g' D' w: what sits on a plate that shakes gets from it what it has. What its
+    tangential part does not give to the springs of contacts is the friction loss. What its normal part does not is lost
+    in impacts, or pushes overlaps of rigid contacts apart where it is a gain. The work of motions is that of prescribed
+    bodies on the others, of the drives of guided and hinged bodies, of what holds bodies in part, of belts, of parts
+    and of the shear of a cell. The rest is the error of the semi-implicit step, of the order of dt:
+    -dt/2 m g (v_new - v_old) per body.
 
     Springs begin a step with what the gaps are, and end it with what gaps linear in the velocities would be, but hold
     no more than impulses have loaded them with (`dem.start.stiffness.elastic_energies`). What they lose or gain
@@ -133,7 +134,8 @@ def energy_balance(step: Step) -> dict[str, float]:
     if world.large_moves and comm.rank == 0:  # the large bodies count once
         of_bodies = tuple(map(sum, zip(of_bodies, _ledger(step, world.large, slice(first, None)))))
     velocity = near.bodies.velocity.copy()
-    velocity[first:][fixed] = world.large.velocity[fixed]
+    if world.step == 1:  # nobody knows how motions went before
+        velocity[first:][fixed] = world.large.velocity[fixed]
     mean = 0.5 * (velocity[first:] + world.large.velocity)
     normal, tangential, came, opening = works(step, step.in_cone, velocity, step.moment)
     of_springs = elastic_energies(step, came, opening)

@@ -15,7 +15,7 @@ from dem.bodies import COMPOUND
 from dem.contact import find_contacts
 from dem.experiment import Experiment
 from dem.model.partition import rebalance
-from dem.motion import Glide, Guided, Hinged
+from dem.motion import Glide, Guided, Hinged, Oscillation
 from dem.record.energies import energy
 from dem.scene import Scene
 from dem.shapes import Plane, Sphere
@@ -23,6 +23,7 @@ from dem.start import new_world
 from dem.step import Step, advance
 from dem.step.system import ContactSystem
 from dem.unconstrained import unconstrained
+from pctt import Simulation
 
 SELF = MPI.COMM_SELF
 DT = 0.01
@@ -80,6 +81,19 @@ def test_a_moving_floor_does_work_through_friction():
     np.testing.assert_allclose(step.force_on("floor")[:3], [-pull / DT, 0, 0], atol=1e-9)
     np.testing.assert_allclose(step.velocity("floor"), [2.0, 0, 0, 0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(step.position("floor"), [2.0 * DT, 0, 0], atol=1e-12)
+
+
+def test_a_plate_that_shakes_does_no_work_in_a_cycle_on_what_sits_on_it():
+    """Next to the greatest kinetic energy."""
+    swing, period, steps = 0.005, 0.2, 50
+    scene = Scene(0.3)
+    scene.add_spheres([0, 0, 0.01], 0.01, 2500.0)
+    scene.add_body("plate", [Plane((0, 0, 1))], Oscillation((0, 0, 1), swing, period))
+    sim = Simulation(scene, dt=period / steps, comm=SELF)
+    sim.run(steps=steps)
+    cycle = [[sim.step()[name] for name in ("work_of_motions [J]", "impact_loss [J]")] for _ in range(steps)]
+    kinetic = 0.5 * sim.local.mass[0] * (2.0 * np.pi * swing / period) ** 2
+    assert np.abs(np.sum(cycle, axis=0)).max() < 0.03 * kinetic
 
 
 @pytest.mark.parametrize(
