@@ -33,9 +33,9 @@ def placed(turns, anchors, frames, place, orientation, period):
     """`Geometry` of joints whose turns are of these kinds (n,), with anchors (n, 2, 3) and frames (n, 2, 4) in bodies
     of these places (n, 2, 3) and orientations (n, 2, 4), in a cell of this period (3,), 0: none.
 
-    The turns are those of the second frame as seen from the first, whose axes a joint holds: the rotation vector; the
+    The turns are those of the second frame seen from the first, whose axes a joint holds: the rotation vector; the
     tilt of the z axis, and the angle about it; or with two pins, the z axis of the first body and the x axis of the
-    second, the Cardan angles, of the cross of both about the first pin, between the pins, and about the second pin. Then
+    second, the Cardan angles, of their cross about the first pin, between the pins, and about the second pin. Then
     the axes are those of the cross."""
     arms, error, axes = np.empty(anchors.shape), np.empty((len(turns), 6)), np.empty((len(turns), 3, 3))
     frame, relative, cross = np.empty((2, 4)), np.empty(4), np.empty(4)

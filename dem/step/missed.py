@@ -93,6 +93,8 @@ def find_turned(
     turn = None if world.large_moves else partial(_turning, forms=world.forms, dt=dt, depth=depth)
     end = find_contacts(advanced(world, free, contacts, velocity), 0.0, among=turn)
     end = end.take(end.gap < -depth)
+    if not on_any(world.comm, bool(len(end)))[0]:
+        return None
     large = large_velocity(world, free, velocity)
     foreseen = _foreseen(world, contacts, velocities_about(contacts, velocity, large), dt, end.key)
     start, approach = _at_start(world, end, velocities_about(end, velocity, large), dt)
