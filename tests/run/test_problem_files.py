@@ -91,8 +91,11 @@ def check_mechanics(line: dict, tmp_path: Path) -> None:
 def test_hard_problems_are_kept_and_the_steps_say_so(program, settled, tmp_path):
     done = program(*HARD, "-steps", 6)
     steps = steps_of(tmp_path / "results")
-    kept = [f"results/hard/step{s['step']:06d}_{s['contacts']}contacts_2its.h5" for s in steps[:5]]
-    assert [line["hard_problem"] for line in steps] == [*kept, ""]
+    hard = [s for s in steps if s["solver"] != s["asked_solver"]]
+    kept = [f"results/hard/step{s['step']:06d}_{s['contacts']}contacts_2its.h5" for s in hard]
+    assert len(kept) >= 3
+    assert [line["hard_problem"] for line in hard] == kept
+    assert {line["hard_problem"] for line in steps} == {*kept, ""}
     assert sorted(str(p.relative_to(tmp_path)) for p in (tmp_path / "results" / "hard").iterdir()) == kept
     assert re.findall(r"hard problem kept: (\S+)\)", done.stdout) == kept
     program("-problem", kept[1], *TOL, "-output", "solved")
