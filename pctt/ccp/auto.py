@@ -97,6 +97,7 @@ class Attempts:
         self.all: list[Result] = []
         self.usual = problem.norm(problem.r) / problem.mean_diagonal  # the size of impulses that the data suggest
         self.most = min(CONIC_ITERATIONS, limits.max_it)
+        self.gathers = gathered.takes(problem, newton)
 
     def keep(self, result: Result, solver: str) -> Result:
         """Note a result. Impulses of self-stress may grow in Coulomb's law until their rounding throws bodies away, and
@@ -116,11 +117,13 @@ class Attempts:
         """What APGD makes of the guess, and whether the problem has few contacts. That is asked only where APGD has not
         come to the aim as soon as the conic method would with few: the answer has its cost."""
         count = partial(options.iterations, self.problem, coulomb=self.coulomb)
-        few = self.newton.may_eliminate(self.problem)
+        few = self.newton.may_eliminate(self.problem) or self.gathers
         spare = options.iterations(self.problem, self.limits.aim, coulomb=False, few=True) if few else 0
         first = self.apgd(guess, count(self.limits.tol, few=few), spare=spare)
         if few and first.residual > self.limits.aimed:
-            few = self.newton.has_elimination(self.problem)
+            has = gathered.has_elimination if self.gathers else self.newton.has_elimination
+            few = has(self.problem)
+            self.gathers &= few
             if not (few or first.converged or first.final or first.exhausted):
                 more = self.apgd(first.impulse, count(self.limits.tol))
                 self.all, first = [more.after(first)], more
@@ -136,14 +139,17 @@ class Attempts:
         if basin:
             limits = limits.but(tol=basin, closing_work=np.inf, closing_speed=np.inf)
         given = self.problem, guess, limits, options, self.newton
-        return self.keep(conic.solve(*given, coulomb=self.coulomb), "conic")
+        found = gathered.solve(*given, coulomb=self.coulomb) if self.gathers else None
+        if found is None or found.status is Status.GIVEN_UP:
+            found = conic.solve(*given, coulomb=self.coulomb)
+        return self.keep(found, "conic")
 
     def beyond(self, guess: Array, few: bool) -> None:
         """To the aim of limits that APGD has met: few contacts by the conic method, where APGD has not found it in its
         first attempt, many by APGD."""
         given = guess, self.rest.but(max_it=self.most), conic.Conic(), self.newton
-        if few or gathered.takes(self.problem, self.newton):
-            method = conic if few else gathered
+        if few:
+            method = gathered if self.gathers else conic
             self.keep(method.solve(self.problem, *given, coulomb=self.coulomb), "conic")
         if self.best.residual > self.limits.aimed and self.limits.spare and not few:
             self.apgd(self.best.impulse, self.limits.max_it, spare=self.limits.spare)

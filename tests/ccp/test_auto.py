@@ -63,7 +63,7 @@ def test_much_friction_is_solved_in_turns():
         alone += not ccp.solve(problem, type="conic", limits=limits, law=ccp.COULOMB).converged
         result = ccp.solve(problem, type="auto", limits=limits, law=ccp.COULOMB)
         unsolved += not result.converged
-        assert result.iterations < 6000
+        assert result.iterations < 600  # on several ranks, too, whose few contacts one of them takes
     assert alone >= 1
     assert unsolved <= alone // 2
 
