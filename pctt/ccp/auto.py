@@ -120,11 +120,12 @@ class Attempts:
         few = self.newton.may_eliminate(self.problem) or self.gathers
         spare = options.iterations(self.problem, self.limits.aim, coulomb=False, few=True) if few else 0
         first = self.apgd(guess, count(self.limits.tol, few=few), spare=spare)
-        if few and first.residual > self.limits.aimed:
+        ended = first.final or first.exhausted
+        if few and first.residual > self.limits.aimed and not ended:
             has = gathered.has_elimination if self.gathers else self.newton.has_elimination
             few = has(self.problem)
             self.gathers &= few
-            if not (few or first.converged or first.final or first.exhausted):
+            if not (few or first.converged):
                 more = self.apgd(first.impulse, count(self.limits.tol))
                 self.all, first = [more.after(first)], more
         return first, few

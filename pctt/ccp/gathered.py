@@ -5,6 +5,8 @@ conic method then takes as long as the messages of one product of all ranks."""
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
@@ -28,8 +30,9 @@ def has_elimination(problem: ConeProblem) -> bool:
     """Whether the systems of the whole problem are solved by elimination on the first rank. Collective."""
     if problem.by_rows().has_dense_columns:
         return False
-    whole = _whole(problem, problem.r)
-    cheap = False
+    cheap, whole = False, None
+    with suppress(ValueError):  # on the first rank: of bodies that fly apart no squares of velocities are numbers
+        whole = _whole(problem, problem.r)
     if whole is not None:
         own = Newton(MPI.COMM_SELF, "body")
         cheap = own.has_elimination(whole[0])
