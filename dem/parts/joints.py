@@ -29,9 +29,9 @@ VECTOR, ABOUT_Z, ABOUT_PINS = range(3)
 
 
 @loop
-def placed(turns, anchors, frames, place, orientation, period):
+def placed(turns, anchors, frames, place, orientation, lengths):
     """`Geometry` of joints whose turns are of these kinds (n,), with anchors (n, 2, 3) and frames (n, 2, 4) in bodies
-    of these places (n, 2, 3) and orientations (n, 2, 4), in a cell of this period (3,), 0: none.
+    of these places (n, 2, 3) and orientations (n, 2, 4), in a cell of these `Cell.lengths` (3,).
 
     The turns are those of the second frame seen from the first, whose axes a joint holds: the rotation vector; the
     tilt of the z axis, and the angle about it; or with two pins, the z axis of the first body and the x axis of the
@@ -67,7 +67,7 @@ def placed(turns, anchors, frames, place, orientation, period):
         _set_axes(own, axes[n])
         for i in range(3):
             d = (place[n, 1, i] + arms[n, 1, i]) - (place[n, 0, i] + arms[n, 0, i])
-            image = period[i] * np.round(d / period[i]) if period[i] > 0.0 else 0.0
+            image = lengths[i] * np.round(d / lengths[i]) if lengths[i] > 0.0 else 0.0
             arms[n, 0, i] += d - image
             relative[i] = d - image
         for i in range(3):
@@ -237,9 +237,9 @@ class Joint(Constraint):
     @classmethod
     def geometry(cls, members: Sequence[Any], row: Ints, cell: Cell) -> Place:
         anchors, frames = (np.array([getattr(joint, name) for joint in members]) for name in ("anchors", "frames"))
-        turns, period = np.array([KINDS[joint.kind].turns for joint in members]), cell.lengths
+        turns, lengths = np.array([KINDS[joint.kind].turns for joint in members]), cell.lengths
 
         def now(position: Floats, orientation: Floats) -> Geometry:
-            return Geometry(*placed(turns, anchors, frames, position[row], orientation[row], period))
+            return Geometry(*placed(turns, anchors, frames, position[row], orientation[row], lengths))
 
         return now
