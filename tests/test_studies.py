@@ -56,7 +56,7 @@ SMALL = [
     "random_scenes 0 3 --steps 3 --processes 1", "drawn_kernels 0 2", "ranks functions",
     "kernels -only imq1 -ways auto plain", "table_plots", "pictures incline -n 2",
 ]  # fmt: skip
-ELSEWHERE = {"compare_chrono", "compare_liggghts", "convert_problems"}
+ELSEWHERE = {"compare_chrono", "compare_liggghts", "compare_mujoco", "convert_problems"}
 DRAWS = {"structure": "matplotlib", "table_plots": "matplotlib", "pictures": "vtkmodules"}  # and nothing else
 
 
@@ -91,6 +91,17 @@ def test_every_study_runs(words, copy):
     done = subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
     assert done.stdout.strip()
+
+
+def test_a_study_writes_its_table_and_its_commit_and_nothing_else(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(STUDIES)
+    shared, page = __import__("shared"), tmp_path / "page.md"
+    monkeypatch.setattr(shared, "commit", lambda: "89abcdef0")
+    text = "# A\n\n| a | b |\n|---|---|\n| 1 | 2 |\n\n## B\nAt commit 01234567:\n\n{}\nAt commit 01234567.\n"
+    old, new = (shared.markdown(["c", "d"], [[value, value]]) for value in (3, 4))
+    page.write_text(text.format(old + "\n"))
+    shared.replace_table(page, "## B\n", new)
+    assert page.read_text() == text.format(new + "\n").replace("01234567", "89abcdef0", 1)
 
 
 def test_the_ranks_of_unfoldings_are_those_of_the_train_that_svd_makes(monkeypatch):

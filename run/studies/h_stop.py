@@ -8,7 +8,8 @@ angle. It has stopped when its mean speed is below a hundredth of sqrt(g d), ove
 h / d, from the mass with a solid fraction of 0.59, the angle at which it stops, and that of the law of glass beads,
 h_stop = 1.65 d (tan 32.8 - tan a) / (tan a - tan 20.9); of several seeds the mean angle, with its standard error. The
 form of the law is that of Pouliquen, Phys. Fluids 11 (1999) 542, with constants of Jop, Forterre, Pouliquen, Nature 441
-(2006) 727, and Forterre, Pouliquen, J. Fluid Mech. 486 (2003) 21. Writes results/h_stop.json.
+(2006) 727, and Forterre, Pouliquen, J. Fluid Mech. 486 (2003) 21. Writes results/h_stop.json, and its table of
+docs/scenes.md if there are several seeds.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from math import atan, degrees, pi, radians, sqrt, tan
 from typing import Any
 
 import numpy as np
-from shared import Table, at_least_one, parser, record, say_machine, spread
+from shared import ROOT, Row, Table, at_least_one, markdown, parser, record, replace_table, say_machine, spread
 
 import pctt
 from dem.experiment import option
@@ -81,13 +82,27 @@ def stopped(layers: int, rate: float, seed: int) -> dict[str, Any]:
     return found | {"glass beads": law(height), "steps": sim.steps, "missed": missed}
 
 
+def write_page(rows: list[Row]) -> None:
+    """The table of docs/scenes.md."""
+    lines = []
+    for layers in dict.fromkeys(row["layers"] for row in rows):
+        mine = [row for row in rows if row["layers"] == layers]
+        angles = [row["angle"] for row in mine]
+        mean, error = spread(angles)
+        each = ", ".join(f"{angle:.1f}" for angle in angles)
+        lines.append([layers, f"{mine[0]['height [d]']:.1f}", each, f"{mean:.1f} ± {error:.1f}",
+                      f"{mine[0]['glass beads']:.1f}"])  # fmt: skip
+    heads = ["layers", "h / d", "stops at", "mean [degrees]", "glass beads"]
+    replace_table(ROOT / "docs" / "scenes.md", "**Where flows stop.**", markdown(heads, lines))
+
+
 def main() -> None:
     words = parser("h_stop", __doc__)
     words.add_argument("layers", nargs="*", type=at_least_one, metavar="LAYERS", help="(2 3 4 6 8 12)")
     words.add_argument("--rate", type=float, default=0.25, help="at which the angle falls, degrees a second (0.25)")
     words.add_argument("--seeds", type=at_least_one, default=1, help="beds of each height (1)")
     given = words.parse_args()
-    about, rows = say_machine(), []
+    about, rows = say_machine(), list[Row]()
     table = Table(layers=("layers", "6d"), seed=("seed", "4d"), h_over_d=("height [d]", "8.2f"),
                   stops_at=("angle", "8.2f"), glass_beads=("glass beads", "11.2f"),
                   missed=("missed", "6d"))  # fmt: skip
@@ -99,6 +114,8 @@ def main() -> None:
             mean, error = spread([row["angle"] for row in rows[-given.seeds :]])
             print(f"{layers:6d}  mean {mean:.2f} +- {error:.2f}", flush=True)
     record("h_stop", about, rows)
+    if given.seeds > 1:
+        write_page(rows)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@
 
 Seconds to 1e-4, 1e-6 and 1e-8 of the convex problem and of Coulomb's law, performance profiles, failures counted. Peers
 (Siconos, Clarabel) are in it where they are installed: apt-get install python3-siconos, .venv/bin/pip install -e
-'.[peers]'. Writes results/profile.json, results/profile.md and results/profile.png. Siconos' text files (.dat) are
-converted first, in a temporary folder.
+'.[peers]'. Writes results/profile.json, results/profile.md and results/profile.png, with --page docs/problems.md.
+Siconos' text files (.dat) are converted first, in a temporary folder.
 
 A solver works on a problem in a process of its own, cold and on one core, to one tolerance after the other. A
 tolerance counts as reached where `pctt.ccp.measure`, which shares no code with any solver, finds the natural
@@ -15,6 +15,7 @@ residual (for Coulomb's law: its residual) below it. Fast solves are repeated, t
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 import tempfile
 import time
@@ -28,6 +29,7 @@ from convert_problems import convert
 from mpi4py import MPI
 from peers import PEERS
 from shared import (
+    ROOT,
     Row,
     called_from,
     figure,
@@ -37,6 +39,7 @@ from shared import (
     next_problem,
     parser,
     record,
+    replace_table,
     say_machine,
     settled,
 )
@@ -65,6 +68,8 @@ VARIANTS = {
     "heavy": "the same with the uppermost grain 1000 times heavier",
     "loose": "the packing stretched by 1 % in height, grains at random velocities of 0.5 m/s and falling",
 }
+
+PAGE = ROOT / "docs" / "problems.md"
 
 Rows = list[Row]
 Problem = tuple[str, Path, int]  # name, file, contacts
@@ -245,9 +250,7 @@ def tables(rows: Rows) -> str:
             "many of these in the shortest time of all solvers, in at most twice, and in at most ten times the\n"
             "shortest time."
         )
-        profiles = [ratios(rows, law, tol)[1] for tol in TOLERANCES]
-        cells = [[f"`{solver}`", *(_counts(ratio[k]) for ratio in profiles)] for k, solver in enumerate(solvers)]
-        parts.append(markdown(["", *(f"{tol:.0e}" for tol in TOLERANCES)], cells))
+        parts.append(profile(rows, law))
         parts.append(f"Seconds to {TOLERANCES[-1]:.0e}. If that was not reached, the residual stands in brackets:")
         found = [[last[name, solver] for solver in solvers] for name in names]
         cells = [[name, row[0]["contacts"], *map(_seconds, row)] for name, row in zip(names, found)]
@@ -256,6 +259,22 @@ def tables(rows: Rows) -> str:
         failed = [row for row in last.values() if not row["reached"]]
         parts.append("\n".join(f"- `{row['method']}`, {row['problem']}: {row['reason']}" for row in failed))
     return "\n\n".join(filter(None, parts))
+
+
+def profile(rows: Rows, law: str) -> str:
+    """The table of how many problems of a law were solved, and how fast."""
+    profiles = [ratios(rows, law, tol) for tol in TOLERANCES]
+    solvers = profiles[0][0]
+    cells = [[f"`{solver}`", *(_counts(ratio[k]) for _, ratio in profiles)] for k, solver in enumerate(solvers)]
+    return markdown(["", *(f"{tol:.0e}" for tol in TOLERANCES)], cells)
+
+
+def write_page(rows: Rows) -> None:
+    """The tables of docs/problems.md and its figure."""
+    for head, law in {"## Results\n": "convex", "### Coulomb's law\n": "coulomb"}.items():
+        replace_table(PAGE, head, profile(rows, law))
+    if (drawn := ROOT / "results" / "profile.png").exists():
+        shutil.copy(drawn, PAGE.with_name("profile.png"))
 
 
 def _counts(ratio: np.ndarray) -> str:
@@ -307,6 +326,7 @@ def read_words() -> tuple[Namespace, list[Path], dict[str, list[str]]]:
     line.add_argument("--variants", type=listed(known=list(VARIANTS)), default="settled",
                       help=f"of their steps, with commas between (settled); {about}")  # fmt: skip
     line.add_argument("--stiffness", type=float, default=np.inf, help="of their contacts [N/m] (inf)")
+    line.add_argument("--page", action="store_true", help="write the tables and the figure of docs/problems.md")
     given = line.parse_args()
     allowed = sorted({name for names in everything.values() for name in names})
     folders = [called_from(word) for word in given.words if called_from(word).is_dir()]
@@ -333,6 +353,8 @@ def main() -> None:
         about = say_machine() | {"limit": given.seconds, "refused": refused}
         rows = solve_all(found, solvers, about)
     show(rows)
+    if given.page:
+        write_page(rows)
 
 
 def solve_all(found: list[Problem], solvers: dict[str, list[str]], about: Row) -> Rows:

@@ -89,6 +89,15 @@ def replace_section(page: Path, head: str, text: str) -> None:
     print(page)
 
 
+def replace_table(page: Path, head: str, table: str) -> None:
+    """Write the first table of a page after its `head`, and the first commit that it names there."""
+    before, found, after = page.read_text("utf-8").partition(head)
+    after = re.sub("(?<=commit )[0-9a-f]{7,}", commit(), after, count=1)
+    after = re.sub(r"(^\|.*\n)+", table + "\n", after, count=1, flags=re.MULTILINE)
+    page.write_text(before + found + after, "utf-8")
+    print(page)
+
+
 class Table:
     """Prints rows as they come, below a line of heads.
 

@@ -19,15 +19,17 @@ in every start, so that the courses part. The solver is `apgd`. For each setting
 - the figure, its standard error as the starts show it, and how far it is off that of the smallest step;
 - iterations a step, and steps that are not solved; of a setting that ends before its time it says why.
 
-Writes results/time_steps.json and .png.
+Writes results/time_steps.json and .png. With --page it makes the table of docs/choose.md instead, in an hour: some
+settings of all cases, beside steps of a tenth (drum, silo: a quarter) to 2e-4 without closing work.
 """
 
 from __future__ import annotations
 
 import math
 import statistics
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -82,6 +84,16 @@ CASES = {
     "shear4": Case(Shear(n=4), 1.5, 0.5, friction, ""),
     "drum8": Case(Drum(), 2.0, 1.0, mean("drum_torque [N m]", -1e3), "mN m"),
     "silo6": Case(Silo(), 1.0, 0.25, flow, "kg/s"),
+}
+FINE = "tol=2e-4,closing_work=inf"
+ON_PAGE = {  # the figure by its name, starts, and settings, of which the first one is what others are off
+    "mixer4": ("mixer n = 4, torque", 12, (f".1,{FINE}", "1", "1.5,tol=1e-3")),
+    "mixer8": ("mixer n = 8, torque", 4, (f".1,{FINE},stiffness=1.8e8", "1", "1,tol=2e-5,closing_work=inf", "2.5")),
+    "mixer16": ("mixer n = 16, torque", 2, (f".1,{FINE}", "1")),
+    "blade4": ("blade n = 4, draft force", 24, (f".1,{FINE},stiffness=1.8e8", "1")),
+    "shear4": ("shear n = 4, stress ratio", 12, (f".1,{FINE}", "1", "1,tol=1e-3")),
+    "drum8": ("drum n = 8, torque", 3, (f".25,{FINE}", "1", "2")),
+    "silo6": ("silo n = 6, flow", 4, (f".25,{FINE}", "1", "2")),
 }
 UNASKED = [name for name in CASES if name != "mixer16"]  # which takes an hour
 
@@ -157,12 +169,51 @@ def draw(cases: list[list[Row]]) -> None:
             axes.legend(fontsize=7)
 
 
+def write_page(cases: dict[str, list[Row]]) -> None:
+    """The table of docs/choose.md."""
+    lines = []
+    for name, (fine, *rows) in cases.items():
+        begins = f"{ON_PAGE[name][0]}, {ON_PAGE[name][1]} starts"
+        for row in rows:
+            factor, _, others = row["settings"].partition(",")
+            step = f"{1e3 * row['dt']:.2g} ms"
+            words = ", ".join([f"**{step}**" if factor == "1" else step, *others.replace(",", ", ").split(", ")])
+            error = 100 * math.hypot(row["error"], fine["error"]) / abs(fine["figure"])
+            off = f"{100 * (row['figure'] / fine['figure'] - 1):+.1f} ± {error:.1f}"
+            lines.append([begins, words.rstrip(", "), f"{row['cpu']:.2g}", f"{row['overlap']:.1f}", off])
+            begins = ""
+    heads = ["scene, figure", "step, settings", "CPU s per s", "worst overlap, % of a radius", "figure off, %"]
+    page, head = shared.ROOT / "docs" / "choose.md", "# Choose dt and the tolerance\n"
+    shared.replace_table(page, head, shared.markdown(heads, lines))
+
+
+def rows_of(name: str, starts: int, settings: Sequence[str]) -> list[Row]:
+    """The rows of a case, which are printed as they come; of a setting that ends before its time there is none."""
+    print(f"{name}, {starts} starts of {CASES[name].seconds:g} s; figure in {CASES[name].unit or '1'}")
+    table = Table(
+        settings=("settings", "<28"), dt_ms=(lambda row: 1e3 * row["dt"], "6.2f"), CPU_s_per_s=("cpu", "11.2f"),
+        overlap=("overlap", "7.2f"), figure=("figure", "9.4g"), error=("error", "7.2g"),
+        its=("iterations", "5.0f"), unsolved=("unsolved", "8d"), stiffness=("stiffness", "9.2g"),
+    )  # fmt: skip
+    rows = []
+    for words in settings:
+        try:
+            rows.append(of_starts(name, words, starts))
+            table.add(rows[-1])
+        except SceneError as error:  # noqa: PERF203 - grains would pass others unseen, or there is no solution
+            print(f"{words:28} ended: {error}", flush=True)
+    return rows
+
+
 def main() -> None:
     line = shared.parser("time_steps", __doc__)
     line.add_argument("case", nargs="*", default=UNASKED, help=f"of {', '.join(CASES)}; mixer16 only if named")
     line.add_argument("--starts", type=shared.at_least_one, default=3, help="of each setting (3)")
     line.add_argument("--settings", nargs="+", default=SETTINGS, help="see above")
+    line.add_argument("--page", action="store_true", help="make the table of docs/choose.md; no other words")
     given = line.parse_args()
+    if given.page and len(sys.argv) > 2:
+        line.error("--page: allowed are no other words with it")
     if unknown := [name for name in given.case if name not in CASES]:
         line.error(f"{unknown[0]}: allowed are {', '.join(CASES)}")
     try:
@@ -170,23 +221,14 @@ def main() -> None:
     except ValueError as error:
         line.error(f"--settings {error}")
     shared.keep_to_one_core()
-    about, cases = shared.say_machine(), []
-    for name in given.case:
-        print(f"{name}, {given.starts} starts of {CASES[name].seconds:g} s; figure in {CASES[name].unit or '1'}")
-        table = Table(
-            settings=("settings", "<28"), dt_ms=(lambda row: 1e3 * row["dt"], "6.2f"), CPU_s_per_s=("cpu", "11.2f"),
-            overlap=("overlap", "7.2f"), figure=("figure", "9.4g"), error=("error", "7.2g"),
-            its=("iterations", "5.0f"), unsolved=("unsolved", "8d"), stiffness=("stiffness", "9.2g"),
-        )  # fmt: skip
-        cases.append([])
-        for words in given.settings:
-            try:
-                cases[-1].append(of_starts(name, words, given.starts))
-                table.add(cases[-1][-1])
-            except SceneError as error:  # noqa: PERF203 - grains would pass others unseen, or there is no solution
-                print(f"{words:28} ended: {error}", flush=True)
-        shared.record("time_steps", about, [row for rows in cases for row in rows])
-    draw(cases)
+    about, cases = shared.say_machine(), dict[str, list[Row]]()
+    for name in ON_PAGE if given.page else given.case:
+        cases[name] = rows_of(name, *(ON_PAGE[name][1:] if given.page else (given.starts, given.settings)))
+        shared.record("time_steps", about, [row for rows in cases.values() for row in rows])
+    if given.page:
+        write_page(cases)
+    else:
+        draw([*cases.values()])
 
 
 if __name__ == "__main__":
