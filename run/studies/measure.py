@@ -5,7 +5,8 @@
     run/study measure preconditioners [N [-every K] [-names A,B]] [...]    what is not known goes to pctt.run
     run/study measure paper [-n N ...]         the paper's comparison on mixer, blade and shear: seconds of a PDIP
                                                solve and of its set-ups, iterations, for nine preconditioners
-    run/study measure pdip [-n N ...]          whole PDIP solves of these scenes, each by one preconditioner
+    run/study measure pdip [-n N ...]          whole PDIP solves of these scenes, each by one preconditioner; without
+                                               sizes it writes its table of docs/preconditioners.md
 
 Writes results/measure_WHAT.json (of preconditioners measure_preconditioners_nN.json), and results/reproduction.png.
 """
@@ -250,6 +251,20 @@ def pdip(given: Namespace, about: Row) -> None:
         for row in rows[-len(WAYS) :]:
             table.add(row)
         record("measure_pdip", about, rows)
+    if given.n == [4, 8, 16]:
+        write_pdip(rows)
+
+
+def write_pdip(rows: list[Row]) -> None:
+    """The table of docs/preconditioners.md."""
+    lines = []
+    for scene, n in dict.fromkeys((row["scene"], row["n"]) for row in rows):
+        mine = [row for row in rows if (row["scene"], row["n"]) == (scene, n)]
+        cells = [f"{row['iterations']:,}, {row['cpu_s']:.3g} ({row['ratio']:.2f})" for row in mine]
+        lines.append([scene, n, f"{mine[0]['contacts']:,}", cells[0].rpartition(" (")[0], *cells[1:]])
+    ways = ("block Jacobi: iterations, s", "default: iterations, s (ratio)", "`BlockICC` always: iterations, s (ratio)")
+    page, head = shared.ROOT / "docs" / "preconditioners.md", "**Whole PDIP solves**"
+    shared.replace_table(page, head, markdown(["scene", "n", "contacts", *ways], lines))
 
 
 def _short(value: object) -> str:
