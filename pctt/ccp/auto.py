@@ -98,6 +98,7 @@ class Attempts:
         self.usual = problem.norm(problem.r) / problem.mean_diagonal  # the size of impulses that the data suggest
         self.most = min(CONIC_ITERATIONS, limits.max_it)
         self.gathers = gathered.takes(problem, newton)
+        self.whole: gathered.Whole | None = None
 
     def keep(self, result: Result, solver: str) -> Result:
         """Note a result. Impulses of self-stress may grow in Coulomb's law until their rounding throws bodies away, and
@@ -122,9 +123,8 @@ class Attempts:
         first = self.apgd(guess, count(self.limits.tol, few=few), spare=spare)
         ended = first.final or first.exhausted
         if few and first.residual > self.limits.aimed and not ended:
-            has = gathered.has_elimination if self.gathers else self.newton.has_elimination
-            few = has(self.problem)
-            self.gathers &= few
+            self.whole = gathered.whole(self.problem) if self.gathers else None
+            few = self.whole is not None or (not self.gathers and self.newton.has_elimination(self.problem))
             if not (few or first.converged):
                 more = self.apgd(first.impulse, count(self.limits.tol))
                 self.all, first = [more.after(first)], more
@@ -134,24 +134,23 @@ class Attempts:
         limits = self.rest.but(max_it=min(most, self.limits.max_it), spare=spare)
         return self.keep(apgd.solve(self.problem, guess, limits, options, coulomb=self.coulomb), "apgd")
 
+    def _conic(self, guess: Array, limits: Limits, options: conic.Conic) -> Result:
+        if self.whole is not None:
+            return self.keep(self.whole.solve(guess, limits, options, self.coulomb), "conic")
+        return self.keep(conic.solve(self.problem, guess, limits, options, self.newton, coulomb=self.coulomb), "conic")
+
     def conic(self, guess: Array, options: conic.Conic, basin: float = 0.0) -> Result:
         """To the limits, or to the ``basin`` of the residual alone."""
         limits = self.rest.but(max_it=self.most)
         if basin:
             limits = limits.but(tol=basin, closing_work=np.inf, closing_speed=np.inf)
-        given = self.problem, guess, limits, options, self.newton
-        found = gathered.solve(*given, coulomb=self.coulomb) if self.gathers else None
-        if found is None or found.status is Status.GIVEN_UP:
-            found = conic.solve(*given, coulomb=self.coulomb)
-        return self.keep(found, "conic")
+        return self._conic(guess, limits, options)
 
     def beyond(self, guess: Array, few: bool) -> None:
         """To the aim of limits that APGD has met: few contacts by the conic method, where APGD has not found it in its
         first attempt, many by APGD."""
-        given = guess, self.rest.but(max_it=self.most), conic.Conic(), self.newton
         if few:
-            method = gathered if self.gathers else conic
-            self.keep(method.solve(self.problem, *given, coulomb=self.coulomb), "conic")
+            self._conic(guess, self.rest.but(max_it=self.most), conic.Conic())
         if self.best.residual > self.limits.aimed and self.limits.spare and not few:
             self.apgd(self.best.impulse, self.limits.max_it, spare=self.limits.spare)
 

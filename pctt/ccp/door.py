@@ -156,15 +156,21 @@ def wrong_velocities(r: Any, shape: tuple[int, ...]) -> str:
 
 
 def refuse_out_of_range(comm: MPI.Comm, r: Array, diagonal: float) -> None:
-    """ValueError on all ranks for velocities r of a problem with this mean of the diagonal of N if squares of them or
-    of the impulses overflow, or vanish: all residuals would be zero or no numbers."""
-    most = greatest(comm, float(np.abs(r).max(initial=0.0)))
-    if most and not all(1.0 / LARGEST <= size <= LARGEST for size in (most, diagonal, most / diagonal)):
+    """ValueError on all ranks for what is `out_of_range`."""
+    if most := out_of_range(comm, r, diagonal):
         raise ValueError(
             f"r of up to {most:.1e} and N of {diagonal:.1e} (the mean of its diagonal): squares of velocities or "
             f"impulses leave the range of double precision; allowed are r, N and r / N from {1.0 / LARGEST:g} to "
             f"{LARGEST:g}, as other units may make them"
         )
+
+
+def out_of_range(comm: MPI.Comm, r: Array, diagonal: float) -> float:
+    """The greatest of velocities r of a problem with this mean of the diagonal of N if squares of them or of the
+    impulses overflow, or vanish: all residuals would be zero or no numbers; else 0. Collective."""
+    most = greatest(comm, float(np.abs(r).max(initial=0.0)))
+    good = not most or all(1.0 / LARGEST <= size <= LARGEST for size in (most, diagonal, most / diagonal))
+    return 0.0 if good else most
 
 
 def padded(rows: Array) -> Array:

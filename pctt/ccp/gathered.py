@@ -5,19 +5,18 @@ conic method then takes as long as the messages of one product of all ranks."""
 
 from __future__ import annotations
 
-from contextlib import suppress
-
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 
 from dem.exchange import offsets
 from pctt.arrays import Array
+from pctt.ccp import door
 from pctt.ccp.delassus import GivenMatrix, rows_in_blocks
 from pctt.ccp.interior import conic
 from pctt.ccp.newton import Newton, by_elimination
 from pctt.ccp.problem import ConeProblem
-from pctt.ccp.result import Limits, Result, Status
+from pctt.ccp.result import Limits, Result
 
 
 def takes(problem: ConeProblem, newton: Newton) -> bool:
@@ -26,53 +25,46 @@ def takes(problem: ConeProblem, newton: Newton) -> bool:
     return few and problem.has_entries and problem.cones.parts == 1
 
 
-def has_elimination(problem: ConeProblem) -> bool:
-    """Whether the systems of the whole problem are solved by elimination on the first rank. Collective."""
-    if problem.by_rows().has_dense_columns:
-        return False
-    cheap, whole = False, None
-    with suppress(ValueError):  # on the first rank: of bodies that fly apart no squares of velocities are numbers
-        whole = _whole(problem, problem.r)
-    if whole is not None:
-        own = Newton(MPI.COMM_SELF, "body")
-        cheap = own.has_elimination(whole[0])
-        own.destroy()
-        whole[0].destroy()
-    return bool(problem.comm.bcast(cheap))
-
-
-def solve(
-    problem: ConeProblem, guess: Array, limits: Limits, options: conic.Conic, newton: Newton, coulomb: bool = False
-) -> Result:
-    """What `conic` makes of the whole problem on the first rank; GIVEN_UP if its systems are not cheap. Collective."""
-    comm, whole = problem.comm, _whole(problem, guess)
-    found = Result(guess, Status.GIVEN_UP, "no order of elimination is cheap", np.inf, 0)
-    if whole is not None:
-        own = Newton(MPI.COMM_SELF, "body")
-        if own.has_elimination(whole[0]):
-            found = conic.solve(*whole, limits.unwatched, options, own, coulomb=coulomb)
-        own.destroy()
-        whole[0].destroy()
-    found = comm.bcast(found)
-    for iteration, residual in enumerate(found.history):
-        limits.report(iteration, residual)
-    if found.status is Status.GIVEN_UP:
-        found.impulse = guess
-    else:
-        first = offsets(comm, len(problem.r))[comm.rank]
-        found.impulse = found.impulse[first : first + len(problem.r)].copy()
-    return found
-
-
-def _whole(problem: ConeProblem, guess: Array) -> tuple[ConeProblem, Array] | None:
-    """The problem of all ranks, and its guess, on the first one; None on the others. Collective."""
+def whole(problem: ConeProblem) -> Whole | None:
+    """The problem as a whole, if its systems are then solved by elimination. Collective."""
     known = problem.by_rows()
-    N = known.rigid_matrix()
-    parts = problem.comm.gather((rows_in_blocks(N), known.r, known.mu, known.compliance, guess))
-    N.destroy()
-    if parts is None:
+    # of bodies that fly apart no squares of velocities are numbers
+    if known.has_dense_columns or door.out_of_range(known.comm, known.r, known.mean_diagonal):
         return None
-    rows, r, mu, soft, start = zip(*parts)
-    N = GivenMatrix(MPI.COMM_SELF, sp.vstack([part.tocsr() for part in rows]).tobsr((3, 3)))
-    given = np.concatenate(r), np.concatenate(mu)
-    return ConeProblem(MPI.COMM_SELF, *given, N=N, compliance=np.concatenate(soft)[:, :2]), np.concatenate(start)
+    found = Whole(known)
+    return found if found.comm.bcast(found.is_cheap) else None
+
+
+class Whole:
+    """A problem of several ranks, gathered once. Its making is collective.
+
+    problem : that of all ranks on the first one, None on the others
+    """
+
+    def __init__(self, known: ConeProblem):
+        self.comm, self._rows = known.comm, len(known.r)
+        N = known.rigid_matrix()
+        parts = self.comm.gather((rows_in_blocks(N), known.r, known.mu, known.compliance[:, :2]))
+        N.destroy()
+        self.problem: ConeProblem | None = None
+        self.is_cheap = False  # known to the first rank alone
+        if parts is not None:
+            rows, *more = zip(*parts)
+            matrix = GivenMatrix(MPI.COMM_SELF, sp.vstack([part.tocsr() for part in rows]).tobsr((3, 3)))
+            r, mu, soft = map(np.concatenate, more)
+            self.problem = ConeProblem(MPI.COMM_SELF, r, mu, N=matrix, compliance=soft)
+            self.is_cheap = by_elimination.order_of(matrix) is not None
+
+    def solve(self, guess: Array, limits: Limits, options: conic.Conic, coulomb: bool = False) -> Result:
+        """What `conic` makes of it on the first rank. Collective."""
+        starts, found = self.comm.gather(guess), None
+        if self.problem is not None and starts is not None:
+            own = Newton(MPI.COMM_SELF, "body")
+            found = conic.solve(self.problem, np.concatenate(starts), limits.unwatched, options, own, coulomb=coulomb)
+            own.destroy()
+        result: Result = self.comm.bcast(found)
+        for iteration, residual in enumerate(result.history):
+            limits.report(iteration, residual)
+        first = offsets(self.comm, self._rows)[self.comm.rank]
+        result.impulse = result.impulse[first : first + self._rows].copy()
+        return result

@@ -12,8 +12,9 @@ from problems import SELF, from_graph, heap, part
 from test_unbounded import squeezed
 
 from pctt import ccp
-from pctt.ccp import Limits, Status, auto
+from pctt.ccp import Limits, Status, auto, gathered
 from pctt.ccp.auto import Auto
+from pctt.ccp.interior import conic
 from pctt.ccp.newton import by_elimination
 
 DONE = "natural residual and closing work below the tolerance"
@@ -66,6 +67,19 @@ def test_much_friction_is_solved_in_turns():
         assert result.iterations < 600  # on several ranks, too, whose few contacts one of them takes
     assert alone >= 1
     assert unsolved <= alone // 2
+
+
+@pytest.mark.parallel(2, 3)
+def test_few_contacts_of_several_ranks_are_gathered_once(monkeypatch):
+    rows, made, comm = gathered.rows_in_blocks, [], MPI.COMM_WORLD
+    monkeypatch.setattr(gathered, "rows_in_blocks", lambda N: made.append(N) or rows(N))
+    known, graph = heap()
+    problem = from_graph(known, graph, comm)
+    found = gathered.whole(problem)
+    results = [found.solve(np.zeros_like(problem.r), Limits(1e-6, 60), conic.Conic()) for _ in range(2)]
+    assert len(made) == 1
+    assert [ccp.measure(problem, result.impulse).natural_residual < 1e-5 for result in results] == [True, True]
+    assert gathered.whole(problem.with_r(1e200 * problem.r)) is None  # no squares of such velocities are numbers
 
 
 def test_the_iterations_of_apgd_grow_with_size_and_accuracy():
