@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import sys
+import time
 from collections.abc import Sequence
 
 import numpy as np
+from mpi4py import MPI
 
 from dem import checks
 from dem.arrays import Floats, Rule
@@ -18,7 +21,9 @@ from dem.quaternion import length
 
 SPARSE = 0.1  #: solid fraction up to which spheres are put at random places one after another
 SWELL = 1e-4  #: by how much radii are larger while overlaps are removed, so that none is left
+GROWTH = 1.03  #: of the radii from stage to stage
 TRIES = 100  #: places for a sphere
+WAIT = 10.0  #: seconds after which the program says how far it is
 
 
 def perturbed(x: Floats, y: Floats, z: Floats, perturbation: float, seed: int) -> Rule:
@@ -62,7 +67,7 @@ def random_packing(
     Along `periodic` axes the box repeats itself; others have walls, which spheres do not cross. Spheres of a tenth of
     the volume are put at random places; then they grow from step to step, and what overlaps is pushed apart (Jodrey,
     Tory, Physical Review A 32 (1985); Lubachevsky, Stillinger, J. Stat. Phys. 60 (1990)). ValueError if `most` rounds
-    of that leave overlaps, as the fraction is too high.
+    of that leave overlaps, as the fraction is too high. The first rank says every WAIT seconds how far it is.
     """
     box = checks.vector("lengths of a packing", checks.positive("lengths of a packing", lengths))
     fraction = checks.number("solid fraction", fraction)
@@ -85,14 +90,45 @@ def random_packing(
     if (taken < 0).any():
         raise ValueError(f"no place for {np.count_nonzero(taken < 0)} of {len(radii)} spheres: the box is too small")
     position, left = place[np.arange(len(radii)), taken], most
+    progress = _Progress(len(radii), math.ceil(-math.log(part) / math.log(GROWTH)))
     while part < 1.0:
-        part = min(1.03 * part, 1.0)
-        position, left = _apart(position, part * radii * (1.0 + SWELL), box, cell, left)
+        part = min(GROWTH * part, 1.0)
+        progress.begin()
+        position, left = _apart(position, part * radii * (1.0 + SWELL), box, cell, left, progress)
     order = random.permutation(len(radii))
     return position[order], radii[order]
 
 
-def _apart(position: Floats, radius: Floats, box: Floats, cell: Cell, most: int) -> tuple[Floats, int]:
+class _Progress:
+    """Says on the terminal how far a packing is. The overlaps of a stage fall exponentially; the last one or two stages
+    take as long as all others."""
+
+    def __init__(self, count: int, stages: int) -> None:
+        self._words, self._stages, self._stage = f"packing {count} spheres", stages, 0
+        self._told = time.monotonic()
+
+    def begin(self) -> None:
+        """A stage begins."""
+        self._stage += 1
+        self._since, self._first = time.monotonic(), 0.0
+
+    def look(self, overlap: float, enough: float) -> None:
+        """The greatest overlap after a round, and that with which the stage ends."""
+        now = time.monotonic()
+        self._first = max(self._first, overlap)
+        if now - self._told < WAIT or MPI.COMM_WORLD.rank > 0:
+            return
+        self._told = now
+        fallen = math.log(self._first / overlap) if overlap > enough else 0.0
+        left = (now - self._since) * math.log(overlap / enough) / fallen if fallen > 0.0 else 0.0
+        more = f", which takes about {left:.0f} s more" if left else ""
+        sys.stderr.write(f"{self._words}: stage {self._stage} of {self._stages}{more}\n")
+        sys.stderr.flush()
+
+
+def _apart(
+    position: Floats, radius: Floats, box: Floats, cell: Cell, most: int, progress: _Progress
+) -> tuple[Floats, int]:
     """The places (n, 3) of spheres moved until overlaps are less than SWELL radii, and how many of the rounds are left.
 
     Spheres that overlap are pushed apart by a part of the overlap, and go on for a part of the way of the last round.
@@ -110,6 +146,7 @@ def _apart(position: Floats, radius: Floats, box: Floats, cell: Cell, most: int)
         walls = np.where(cell.axes, 0.0, np.clip(position, radius[:, None], box - radius[:, None]) - position)
         if (deep < SWELL * reach / 2.0).all() and (np.abs(walls) < SWELL * radius[:, None] / 2.0).all():
             return position, rounds
+        progress.look(float((deep / reach).max(initial=0.0)), SWELL / 2.0)
         displacement = 0.8 * displacement + 0.15 * (shift + 2.0 * walls)
         position = cell.wrapped(position + displacement)
     raise ValueError(f"a packing of {len(radius)} spheres still overlaps by {(deep / reach).max():.1e} of their size: "

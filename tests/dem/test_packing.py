@@ -1,8 +1,11 @@
 """Random packings: no overlap, the solid fraction, the sizes, and what is refused."""
 
+import re
+
 import numpy as np
 import pytest
 
+from dem import packing
 from dem.packing import perturbed, random_packing
 from dem.parts.sizes import Listed, Uniform
 
@@ -59,6 +62,16 @@ def test_shares_of_a_sieve_curve_are_those_of_the_mass():
 def test_several_sizes_of_a_packing_are_alike():
     radius = random_packing((1, 1, 1), [0.03, 0.06], 0.3, seed=1)[1]
     assert (radius == 0.06).mean() == pytest.approx(0.5, abs=4 * np.sqrt(0.25 / len(radius)))
+
+
+def test_a_packing_that_takes_long_says_how_far_it_is(monkeypatch, capfd):
+    monkeypatch.setattr(packing, "WAIT", 0.0)
+    random_packing((1, 1, 1), 0.1, 0.4, periodic=(True, True, True))
+    lines = capfd.readouterr().err.splitlines()
+    stages = [int(re.fullmatch(r"packing 96 spheres: stage (\d+) of 16(, which takes about \d+ s more)?", line)[1])
+              for line in lines]  # fmt: skip
+    assert stages == sorted(stages)
+    assert stages[-1] == 16
 
 
 def test_what_cannot_be_packed_is_refused():
