@@ -42,7 +42,7 @@ from dem.record.energies import energy
 from dem.scene import LargeBody, Scene, SurfaceVelocity
 from dem.start import step_remark
 from dem.start.doubts import RoomWatch, doubts
-from dem.start.time_step import distance_remark, fall_remark, reason, smallest
+from dem.start.time_step import distance_remark, fall_remark, reason, small_remark, smallest
 from dem.start.tools import PaceWatch, SwingWatch, half_turn_remark
 from dem.start.turns import TurnWatch
 from dem.step import Step
@@ -162,8 +162,9 @@ class Simulation:
             warn(comm, large)
         if likely := "" if restart else comm.bcast(doubts(scene)):
             warn(comm, likely)
-        if distant := comm.bcast(distance_remark(scene, self.settings.delta)):
-            warn(comm, distant)
+        for remark, given in ((distance_remark, self.settings.delta), (small_remark, self.settings.dt)):
+            if words := comm.bcast(remark(scene, given)):
+                warn(comm, words)
         half = smallest(scene)
         self._watches = TurnWatch(), SwingWatch(), PaceWatch(half, scene.leaving), LooseWatch(half), RoomWatch()
         self._tell_turns()

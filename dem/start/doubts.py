@@ -12,6 +12,7 @@ from dem.mesh import Mesh
 from dem.parts.ends import Tie
 from dem.scene import Scene, kinds_of
 from dem.start.falls import ends
+from dem.start.time_step import contact_distance
 from dem.start.tools import hull
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 HUGE = 50.0  #: lengths of the bed; in millimetres a mesh as long as a twentieth of it is longer
 HEAVY = 1e7  #: hundreds of times osmium: a body that is to be heavy beside others has less [kg/m^3]
+ROUNDING = 1e-3  #: of places over the contact distance: by it rigid contacts shake grains with a hundredth of gravity
 LIGHT = 10.0  #: less than foams have [kg/m^3]; solids have 0.5 to 22.6 g/cm^3
 STEPS = 100  #: without room for the first grain of a source
 
@@ -26,7 +28,8 @@ STEPS = 100  #: without room for the first grain of a source
 def doubts(scene: Scene) -> str:
     """What is likely a mistake, in words: of materials, laws, densities, sizes, of what bears grains; empty if nothing
     is."""
-    return "; ".join(filter(None, (scene.doubts(), _density(scene), _huge(scene), _far(scene), _bottomless(scene))))
+    found = (look(scene) for look in (Scene.doubts, _density, _huge, _far, _remote, _bottomless))
+    return "; ".join(filter(None, found))
 
 
 def _density(scene: Scene) -> str:
@@ -69,6 +72,19 @@ def _far(scene: Scene) -> str:
         if end is not None and (away := math.hypot(*anchor)) > HUGE * widest
     ]  # fmt: skip
     return "; ".join(found)
+
+
+def _remote(scene: Scene) -> str:
+    """Of grains so far from the origin that gaps drown in the rounding of their places."""
+    if not scene.count:
+        return ""
+    grains, delta = scene.survey(), contact_distance(scene)
+    away = float(np.abs([grains.low, grains.high]).max())
+    coarse = float(np.spacing(away))
+    if coarse <= ROUNDING * delta:
+        return ""
+    too = f"places are apart by {coarse:.2g} m in double precision, too coarse for contacts within {delta:.2g} m"
+    return f"grains are up to {away:.3g} m away from the origin, where {too}: put the origin among the grains"
 
 
 def _bottomless(scene: Scene) -> str:

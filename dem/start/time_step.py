@@ -25,6 +25,7 @@ from dem.start.turns import TURN, held_beside, turning_of_grains, turning_of_lar
 
 FALLING = 0.1  #: the step in units of sqrt(R / g), where no tool is fast
 FALLS = 1.5  #: the way in a step, in radii, of a grain that has fallen; two are the limit of `dem.step.fast`
+FEW = 1e-3  #: of the recommended step: codes of soft contacts need such steps
 PARTS = 20.0  #: radii over the contact distance; with 5, forces are the same and steps take a quarter longer
 
 
@@ -72,6 +73,14 @@ def fall_remark(scene: Scene, dt: float) -> str:
         return ""
     most = _rounded(FALLS * size / speed)
     return f"dt {dt:g} s is too large: falls lead to {speed:.3g} m/s, further than two radii in a step; take {most:g} s"
+
+
+def small_remark(scene: Scene, dt: float) -> str:
+    """Return what to say of a dt [s] that is much less than the recommended one; empty if it is not."""
+    usual = recommended(scene)
+    if dt >= FEW * usual:
+        return ""
+    return f"dt {dt:g} s is {usual / dt:.1g} times less than this scene needs, and as many more steps; take {usual:g} s"
 
 
 def falling(scene: Scene, pressed: Pressing) -> float:

@@ -105,9 +105,9 @@ def test_unused_materials_and_rolling_of_more_than_a_radius_are_told():
         Simulation(scene)
 
 
-def bare(friction=0.5, density=1500.0, **law):
+def bare(friction=0.5, density=1500.0, away=0.0, **law):
     scene = Scene(friction, **law)
-    scene.add_spheres([0, 0, 0.3], 0.05, density)
+    scene.add_spheres([away, 0, 0.3], 0.05, density)
     return scene
 
 
@@ -167,6 +167,8 @@ def drained():
     (floored(friction=30.0), "friction 30: is it an angle in degrees"),
     (floored(static_friction=26.6), "friction 26.6: is it an angle in degrees"),
     (in_millimetres(), "the mesh of 'wheel' is 200 m long: is it in mm, scale=1e-3"),
+    (floored(away=-1e12), r"grains are up to 1e\+12 m away .* apart by 0.00012 m .* too coarse for .* 0.0025 m"),
+    (floored(away=1e9), ""),
     (bare(), "the grains fall for ever, as no part of a large body is below them: a floor is"),
     (walled(), "the grains fall for ever"),
     (repeated(1.0, 1.0, None), "the grains fall for ever"),
@@ -191,11 +193,13 @@ def test_friction_and_contact_distances_beyond_the_rest_of_the_scene():
         Simulation(floored(friction=1e3))
     with pytest.warns(UserWarning, match=r"delta 100 m is more than the greatest grain, 0.1 m: .* 0.0025 m, is usual"):
         sim = Simulation(falling(), delta=100.0)
+    with pytest.warns(UserWarning, match=r"^dt 1e-06 s is 7e\+03 times less than this scene needs, .*; take 0.0071 s"):
+        Simulation(falling(), dt=1e-6)
     with pytest.raises(ValueError, match="friction 1000 with tol"):
         sim.change("pair glass, default", friction=1e3)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        Simulation(falling(), delta=0.1)
+        Simulation(falling(), delta=0.1, dt=1e-5)
 
 
 def test_calls_with_what_they_cannot_take(tmp_path):
