@@ -408,7 +408,10 @@ class Mesh:
         return cls(vertices.reshape(-1, 3), np.concatenate(triangles).reshape(-1, 3), center, quaternion)
 
     def write(self, file: str | Path) -> None:
-        """Write the triangles, in their own frame and in metres, as an STL or OBJ file, by the end of its name."""
+        """Write the triangles, in their own frame and in metres, as an STL or OBJ file, by the end of its name.
+        ValueError for another one."""
+        if Path(file).suffix.lower() not in (".stl", ".obj"):
+            raise ValueError(f"{file}: allowed is a name that ends in .stl or .obj")
         trimesh = _trimesh(f"{file}: meshes are written")
         trimesh.Trimesh(self.vertices, self.triangles, process=False).export(str(file))
 

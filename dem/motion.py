@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Union, get_args
 
 import numpy as np
 
-from dem import quaternion
+from dem import checks, quaternion
 from dem.arrays import Floats
 from dem.checks import check_fields, finite, number, numbers, positive, rows, unit_quaternion, unit_vector, vector
 
@@ -337,7 +337,8 @@ class Path:
                 time, *place = map(float, words)
                 found.append((time, vector("place", place)))
             except ValueError:
-                raise ValueError(f"{file}, line {row}: not a time and three coordinates: {line.strip()}") from None
+                allowed = "not a time and three coordinates, as 0.5, 0, 0, 1.2; names begin with #"
+                raise ValueError(f"{file}, line {row}: {checks.short(line.strip())}: {allowed}") from None
         try:
             return cls(*zip(*found)) if found else cls((), ())
         except ValueError as error:

@@ -74,6 +74,8 @@ def random_packing(
     if not 0.0 < fraction < 0.74:
         raise ValueError(f"solid fraction must be between 0 and 0.74, got {fraction:g}")
     sizes = sizes_of(radius)
+    if np.shape(periodic) != (3,):
+        raise ValueError(f"periodic {periodic!r}: allowed are three, for x, y and z, such as (True, True, False)")
     if 2.0 * sizes.ends[1] * (2.0 if any(periodic) else 1.0) > box.min():
         raise ValueError(f"spheres of radius {sizes.ends[1]:g} m do not fit into a box with a side of {box.min():g} m")
     random = np.random.default_rng(checks.seed("seed of a packing", seed))

@@ -19,6 +19,7 @@ from mpi4py import MPI
 
 from dem import measures
 from dem.arrays import Floats
+from dem.checks import short
 from dem.measures import Fields, Sample
 from dem.measures.images import nearest_image
 from dem.mesh import Mesh
@@ -31,6 +32,8 @@ def sample(folder: Folder, step: int) -> Sample:
 
     Older records have no centres at the start of the step: those of the end, less dt times the velocities, stand for
     them, without what impacts and turning motions have moved."""
+    if not isinstance(folder, Folder):
+        raise ValueError(f"folder {folder!r}: allowed is a pctt.folder.Folder, such as Folder('results')")
     folder.require_frames()
     frame = folder.frame(step)
     table, grains = frame.table, slice(frame.table.grains)
@@ -90,6 +93,8 @@ def triangle_forces(folder: Folder, step: int, name: str) -> Floats:
 def write_fields(path: str | Path, fields: Fields) -> None:
     """Write fields as image data of VTKHDF with a value per cell, for ParaView 5.11 or newer. FileError if the file
     cannot be written. One rank writes."""
+    if not isinstance(fields, Fields):
+        raise ValueError(f"fields {short(fields)}: allowed are those of dem.measures.fields")
     path, shape = Path(path), np.array(fields.density.shape)
     columns = {name: value for name, value in fields._asdict().items() if name not in ("low", "spacing")}
     with whole(path) as temporary, hdf5(temporary) as file:

@@ -87,6 +87,8 @@ def read_spheres(
     is no number, or is missing.
     """
     checks.positive("length", 1.0 if length is None else length)
+    if not isinstance(frame, (int, np.integer)):
+        raise ValueError(f"frame {frame!r}: allowed is a whole number, -1 for the last one")
     try:
         data = Path(path).read_bytes()
         data = gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data

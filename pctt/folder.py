@@ -252,7 +252,9 @@ class Folder:
         return self.table.radius
 
     def frame(self, step: int) -> Frame:
-        """A recorded step; FileError if its file is damaged."""
+        """A recorded step; FileError if there is no such step, or if its file is damaged."""
+        if not isinstance(step, (int, np.integer)) or not self.frame_path(step).exists():
+            raise FileError(f"no step {step!r} in {self!r}")
         if not hasattr(self, "large"):
             self.require_frames()
 

@@ -162,9 +162,9 @@ class Simulation:
             warn(comm, large)
         if likely := "" if restart else comm.bcast(doubts(scene)):
             warn(comm, likely)
-        for remark, given in ((distance_remark, self.settings.delta), (small_remark, self.settings.dt)):
-            if words := comm.bcast(remark(scene, given)):
-                warn(comm, words)
+        for other in (distance_remark(scene, self.settings.delta), small_remark(scene, self.settings.dt)):
+            if told := comm.bcast(other):
+                warn(comm, told)
         half = smallest(scene)
         self._watches = TurnWatch(), SwingWatch(), PaceWatch(half, scene.leaving), LooseWatch(half), RoomWatch()
         self._tell_turns()
@@ -245,8 +245,7 @@ class Simulation:
         """Make a step of dt; its `figures`. Warns of a jump of energy. SceneError if a body is lost, if code of the
         scene fails, or if the contacts have no solution: the state is then that before the step, which may be tried
         again, but `last` is None."""
-        if self._closed:
-            raise ValueError("this simulation is closed")
+        self._refuse_closed("step")
         self.last = None  # frees the arrays of the last step
         try:
             made = self.stepper.step()
@@ -482,6 +481,7 @@ class Simulation:
 
         The first rank's values count, and checkpoints keep them. ValueError for a name that is not there, and for what
         it cannot have (`dem.model.changes.change`)."""
+        self._refuse_closed("change")
         together(self.comm, what, partial(refuse_functions, what, values), own=(ValueError,))
         values = self.comm.bcast(values)
         self._refuse_steep({name: values[name] for name in ("friction", "static_friction") if name in values})
@@ -554,6 +554,7 @@ class Simulation:
         The first rank's values count. ``overwrite`` replaces another run there once a step is made. A simulation loaded
         from the folder's own checkpoint goes on with its files. FileError if another run has the folder.
         """
+        self._refuse_closed("write")
         if self.output is not None:
             raise OptionError(f"write {folder}: this simulation writes to {self.output.place.folder} already")
         given = folder, overwrite, every, checkpoint_every, checkpoint_minutes, hard, problems
@@ -601,6 +602,10 @@ class Simulation:
             if self.output.analysis is None:
                 self.analyse()
         self._free()
+
+    def _refuse_closed(self, call: str) -> None:
+        if self._closed:
+            raise ValueError(f"{call}: this simulation is closed; allowed is copy(), which goes on from its state")
 
     def _free(self) -> None:
         self._closed = True

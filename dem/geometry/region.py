@@ -9,7 +9,7 @@ from typing import Any, Union, get_args
 import numpy as np
 
 from dem.arrays import Bools, Floats
-from dem.checks import check_fields, positive, vector
+from dem.checks import check_fields, positive, short, vector
 from dem.compiled import loop
 
 
@@ -124,4 +124,4 @@ def refuse_region(what: str, region: Any, *allowed: type) -> None:
     kinds = allowed or get_args(Region)
     if not isinstance(region, kinds):
         names = " or a ".join(kind.__name__ for kind in kinds)
-        raise ValueError(f"region of {what}: allowed is a {names} of pctt.measures, got {region!r}")
+        raise ValueError(f"region of {what}: allowed is a {names} of pctt.measures, got {short(region)}")

@@ -53,12 +53,12 @@ class Sample:
             raise ValueError(f"material {material!r}: allowed is one of {', '.join(self.materials)}")
         return self.material == self.materials.index(material)
 
-    def marked(self, mask: Any) -> Bools:
+    def marked(self, mask: Any, also: str = "") -> Bools:
         """A mask of the grains as an array (n,); ValueError for anything else, as numbers would be taken for rows."""
         array = np.asarray(mask)
         if array.shape != self.mass.shape or (array.dtype != bool and len(array)):
-            what = f"{array.shape} of {array.dtype}"
-            raise ValueError(f"mask: allowed is True or False for each of the {len(self.mass)} grains here, got {what}")
+            allowed = f"{also}True or False for each of the {len(self.mass)} grains here"
+            raise ValueError(f"mask: allowed is {allowed}, got {array.shape} of {array.dtype}")
         return array.astype(bool)
 
     def grains_in(self, low: Floats, high: Floats, reach: float = 0.0) -> tuple[Ints, Floats, Floats]:

@@ -13,6 +13,8 @@ from dem.measures.grains import bearing, branches, ends
 from dem.measures.images import images
 from dem.measures.sample import Sample, measure, summed
 
+OR = "a Block, a Cylinder, or "  #: what a region may be that is no mask
+
 
 @measure
 def stress(sample: Sample, region: Region | Bools, volume: float | None = None) -> Floats:
@@ -24,7 +26,8 @@ def stress(sample: Sample, region: Region | Bools, volume: float | None = None) 
         row, point, branch = branches(sample, end, *region.bounds)
         part, force = region.part(point, point + branch), end.force.take(row, axis=0)
     else:
-        part, force, branch = _everywhere(sample, sample.marked(region))[end.grain], end.force, end.center - end.point
+        mask = sample.marked(region, OR)
+        part, force, branch = _everywhere(sample, mask)[end.grain], end.force, end.center - end.point
     return summed(sample, (part[:, None] * force).T @ branch) / _volume(region, volume)
 
 
@@ -37,7 +40,7 @@ def kinetic_stress(sample: Sample, region: Region | Bools, volume: float | None 
         inside = region.contains(place)
         mass, velocity = sample.mass[row[inside]], velocity[inside]
     else:
-        rows = sample.marked(region)
+        rows = sample.marked(region, OR)
         mass, velocity = sample.mass[rows], sample.velocity[rows, :3]
     total = summed(sample, np.append(mass @ velocity, mass.sum()))
     beyond = velocity - total[:3] / (total[3] or 1.0)

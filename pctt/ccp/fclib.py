@@ -29,12 +29,14 @@ from mpi4py import MPI
 from scipy.sparse.linalg import MatrixRankWarning, spsolve
 
 from dem.contact_map import BlockRows
+from dem.exchange import refuse
 from pctt.arrays import Array
 from pctt.blocks import square_block_matrix
 from pctt.ccp.cones import Cones, FrictionCones, RollingCones
 from pctt.ccp.delassus import DENSE, rows_in_blocks
 from pctt.ccp.problem import ConeProblem
 from pctt.disk import FileError, hdf5, refuse_links, whole
+from pctt.options import short
 
 __all__ = ["FileFormatError", "Info", "Solution", "Stored", "load", "read", "write_global", "write_local"]
 
@@ -384,6 +386,10 @@ def _write(
     extra: dict[str, Any],
 ) -> None:
     """Gather the vectors, then write ``/fclib_local`` or ``/fclib_global`` under a temporary name until it is whole."""
+    given = (("info", info, Info), ("solution", solution, Solution), ("guess", guess, Solution))
+    wrong = [f"{name} {short(each)}: allowed is a {kind.__name__} of pctt.ccp.fclib" for name, each, kind in given
+             if not isinstance(each, (kind, type(None)))]  # fmt: skip
+    refuse(comm, "; ".join(wrong))
     top = f"fclib_{form}"
     arrays = {f"{top}/vectors/{name}": np.ravel(x) for name, x in vectors.items()}
     for name, state in (("solution", solution), ("guesses/1", guess)):

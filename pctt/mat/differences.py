@@ -114,7 +114,7 @@ def from_differences(
     """
     mat = PETSc.Mat().create(comm=comm or PETSc.COMM_WORLD)
     ranks, shape = mat.comm.tompi4py(), whole_numbers(grid)
-    wrong = "" if shape else f"a grid of shape {grid!r}; allowed are whole numbers >= 1"
+    wrong = "" if shape else f"a grid of shape {grid!r}; allowed is a tuple of whole numbers >= 1"
     if not (isinstance(block, (int, np.integer)) and block >= 1):
         wrong = f"block = {block!r}; allowed are whole numbers >= 1"
     refuse(ranks, wrong and f"pctt.mat.from_differences: {wrong}")

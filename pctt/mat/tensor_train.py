@@ -346,7 +346,7 @@ def from_entries(
     """
     mat = PETSc.Mat().create(comm=comm or PETSc.COMM_WORLD)
     shape = whole_numbers(grid)
-    wrong = f"a grid of shape {grid!r}; allowed are whole numbers >= 1" if shape is None else ""
+    wrong = f"a grid of shape {grid!r}; allowed is a tuple of whole numbers >= 1" if shape is None else ""
     rows = prod(shape or ())
     if rows >= 2**31:  # because pairs of rows are keys of 64 bits
         wrong = f"a grid of shape {grid!r} with {rows} points; allowed are fewer than 2^31"

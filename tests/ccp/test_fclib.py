@@ -424,6 +424,8 @@ def test_a_local_problem_is_written_and_read_again(tmp_path, given):
     assert np.allclose(dense(alone), known.N, atol=1e-13 * np.abs(known.N).max())
     with pytest.raises(OSError, match=r"nowhere/local\.h5: cannot write"):
         fclib.write_local(tmp_path / "nowhere" / "local.h5", problem)
+    with pytest.raises(ValueError, match="info 'a title': allowed is a Info .*; solution .*: allowed is a Solution"):
+        fclib.write_local(tmp_path / "other.h5", problem, "a title", known.g[mine])
     with pytest.raises(FileFormatError, match="absent"):
         fclib.read(tmp_path / "absent.h5", comm)
 

@@ -148,9 +148,10 @@ def test_a_path_from_a_file(tmp_path):
     with pytest.raises(ValueError, match=r"none.csv: cannot be read \(No such file or directory\)"):
         Path.read(tmp_path / "none.csv")
     for text, words in (
-        ("0 0 0 0\n1 2 3\n", "line 2: not a time and three coordinates: 1 2 3"),
-        ("0 0 0 x\n", "line 1: not a time"),
-        ("0 0 0 nan\n", "line 1: not a time"),
+        ("0 0 0 0\n1 2 3\n", "line 2: '1 2 3': not a time and three coordinates, as 0.5"),
+        ("0 0 0 x\n", "line 1: '0 0 0 x': not a time"),
+        ("0 0 0 nan\n", "line 1: .*: not a time"),
+        ("t,x,y,z\n0,0,0,0", "line 1: 't,x,y,z': .*; names begin with #"),
         ("0 0 0 0\n0 1 1 1\n", "must ascend from zero or later, got 0, 0"),
         ("# nothing\n", "must ascend from zero or later, got none"),
     ):

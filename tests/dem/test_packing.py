@@ -83,6 +83,9 @@ def test_what_cannot_be_packed_is_refused():
         random_packing((1, 1, 1), [0.1, -0.1], 0.3)
     with pytest.raises(ValueError, match="between 0 and 0.74"):
         random_packing((1, 1, 1), 0.1, 0.8)
+    for periodic in (True, "xyz", (True, True)):
+        with pytest.raises(ValueError, match="periodic .*: allowed are three, for x, y and z"):
+            random_packing((1, 1, 1), 0.1, 0.3, periodic=periodic)
     for seed in (None, 1.5, -1, True):  # None would be another packing on every rank
         with pytest.raises(ValueError, match=f"seed of a packing {seed}: allowed is a whole number from 0 on"):
             random_packing((1, 1, 1), 0.1, 0.3, seed=seed)

@@ -75,6 +75,8 @@ def test_a_frame_of_a_dump_is_chosen(tmp_path):
     assert [read_spheres(path, frame=k)["positions"][0, 0] for k in (0, 2, -1)] == [0, 2, 3]
     with pytest.raises(ValueError, match=r"frame 4: the file has 4; allowed is -4 to 3"):
         read_spheres(path, frame=4)
+    with pytest.raises(ValueError, match=r"frame 0.5: allowed is a whole number, -1 for the last one"):
+        read_spheres(path, frame=0.5)
 
 
 # -- other files ---------------------------------------------------------------------------------------------

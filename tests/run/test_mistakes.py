@@ -12,8 +12,9 @@ from mpi4py import MPI
 
 import pctt
 from dem.together import SceneError
-from pctt import Box, Dynamic, Fixed, Glide, Mesh, Plane, Rotation, Scene, Simulation, measures
+from pctt import Box, Dynamic, Fixed, Glide, Mesh, Plane, Rotation, Scene, Simulation, analysis, measures
 from pctt.disk import FileError
+from pctt.folder import Folder
 from pctt.options import OptionError, read
 from pctt.run.settings import Run
 from pctt.scenes import Mixer
@@ -431,6 +432,32 @@ def test_a_source_that_never_has_room_is_told_once():
         sim.run(steps=110)
     assert [sim.source(name).count for name in ("buried", "rain")] == [0, 3]
     assert sum("makes no grain" in str(each.message) for each in told) == 1
+
+
+def test_calls_that_come_too_late_or_for_what_is_not_there(tmp_path):
+    scene = floored()
+    scene.add_body("mesh", [Mesh.revolved([(0, 0), (1, 0)], 8)], position=(0, 0, -1))
+    with Simulation(scene, dt=0.01) as sim:
+        sim.write(tmp_path / "run", every=2)
+        sim.run(steps=4)
+    folder = Folder(tmp_path / "run")
+    closed = "this simulation is closed; allowed is copy"
+    with pytest.raises(FileError, match="no step 3 in <Folder .*: 2 recorded steps, 2 to 4>"):
+        folder.frame(3)
+    for words, call in {
+        f"step: {closed}": sim.step,
+        f"write: {closed}": lambda: sim.write(tmp_path / "other"),
+        f"change: {closed}": lambda: sim.change("body floor", motion=Fixed()),
+        r"folder 'run': allowed is a pctt.folder.Folder, such as": lambda: analysis.sample("run", 4),
+        "fields 3: allowed are those of dem.measures": lambda: analysis.write_fields(tmp_path / "a.vtkhdf", 3),
+        "mask: allowed is a Block, a Cylinder, or True or": lambda: measures.stress(sim.sample, ((0, 0, 0), (1, 1, 1))),
+        r"region of a fabric tensor: .*, got \[True\]": lambda: measures.fabric(sim.sample, np.ones(1, bool)),
+        "a.xyz: allowed is a name that ends in .stl or": lambda: Mesh.revolved([(0, 0), (1, 0)], 8).write("a.xyz"),
+    }.items():
+        with pytest.raises(ValueError, match=words):
+            call()
+    sim.copy().step()
+    assert not (tmp_path / "other").exists()
 
 
 def test_files_go_to_a_folder_that_is_named():
