@@ -73,6 +73,8 @@ def numbers(name: str, values: Any) -> Floats:
     numbers."""
     try:
         array = np.asarray(values)
+        if array.dtype.kind == "O" and None in array.ravel().tolist():  # which would be NaN
+            raise TypeError
         return array.astype(np.float64, casting="unsafe" if array.dtype.kind in "OUS" else "same_kind", copy=False)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: allowed are real numbers, got {short(values)}") from None

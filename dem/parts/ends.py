@@ -41,8 +41,13 @@ class Tie(Named):
         object.__setattr__(self, "anchors", anchors)
 
     def refuse(self, name: str, world: Any) -> None:
+        """ValueError for a tie of bodies that no force moves, which would do nothing, and of grains beside outlets."""
+        kind, motion = type(self).__name__.lower(), {body.name: body.motion for body in world.large_bodies}
+        if not any(isinstance(end, int) or isinstance(motion.get(end), Dynamic) for end in self.ends):
+            ends = " and ".join("the world" if end is None else repr(end) for end in self.ends)
+            what = f"{kind} {name!r}: the motions of {ends} are prescribed, so it holds nothing"
+            raise ValueError(f"{what}; allowed is one body at least that forces move, by Dynamic() say")
         if world.passages.removes and any(isinstance(end, int) for end in self.ends):
-            kind = type(self).__name__.lower()
             raise ValueError(f"{kind} {name!r} holds a grain: with outlets {kind}s may hold large bodies alone")
 
 
@@ -80,16 +85,6 @@ class Condition(NamedTuple):
 class Constraint(Tie):
     """A part whose impulses follow from what it asks of relative velocities of its bodies, together with those of all
     contacts; see `dem.unconstrained.constraints`."""
-
-    def refuse(self, name: str, world: Any) -> None:
-        """ValueError for a constraint of bodies that no force moves: it would hold nothing."""
-        super().refuse(name, world)
-        motion = {body.name: body.motion for body in world.large_bodies}
-        if not any(isinstance(end, int) or isinstance(motion.get(end), Dynamic) for end in self.ends):
-            kind = type(self).__name__.lower()
-            ends = " and ".join("the world" if end is None else repr(end) for end in self.ends)
-            what = f"{kind} {name!r}: the motions of {ends} are prescribed, so it holds nothing"
-            raise ValueError(f"{what}; allowed is one body at least that forces move, by Dynamic() say")
 
     @classmethod
     def geometry(cls, members: Sequence[Any], row: Ints, cell: Cell) -> Place:

@@ -207,11 +207,15 @@ def test_calls_with_what_they_cannot_take(tmp_path):
     scene = falling()
     scene.add_spring("rope", 0, 1, stiffness=1.0)
     sim = Simulation(scene, dt=0.01)
+    idle = falling()
+    idle.add_spring("idle", None, "floor", stiffness=1.0)
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     sim.run(steps=1, call=None)
     for words, call in {
         r"run\(call=...\) 3: allowed is a function": lambda: sim.run(steps=1, call=3),
         r"run\(until=...\): allowed is one number": lambda: sim.run(until=[1, 2]),
+        "spring 'idle': the motions of the world and 'floor' are prescribed, so it holds": lambda: Simulation(idle),
+        "positions: allowed are real numbers, got None": lambda: Scene(0.5).add_spheres(None, 0.1, 1500.0),
         "no spring 'x'; there are: rope": lambda: sim.spring_force("x"),
         "body floor: no values; allowed are some by name": lambda: sim.change("body floor"),
         "change 3: allowed is a kind and a name": lambda: sim.change(3, speed=1.0),
