@@ -22,12 +22,12 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from pctt.blocks import refuse_unready, shell_of
-from pctt.mat.order import Places, places_of
-from pctt.options import describe, option, read
+from pctt.blocks import shell_of
+from pctt.mat.order import places_of
+from pctt.options import option
 from pctt.pc.incomplete_cholesky import BAD_BLOCK, BAD_PIVOT, MOST, Array, Blocks, Factor, compile_loops, factorised
-from pctt.pc.mat import is_symmetric
-from pctt.petsc import Context, block_values, given_options, on_coordinates, set_failed, warn
+from pctt.pc.mat import Preconditioner, is_symmetric
+from pctt.petsc import block_values, set_failed
 
 _RAISED = 2.0  # factor on a shift with which a pivot was bad
 _GREATEST = 16.0  # shift: a matrix that is scaled by its diagonal blocks has hardly any off them beside it
@@ -55,7 +55,7 @@ class Options:
     )  # fmt: skip
 
 
-class BlockICC(Context):
+class BlockICC(Preconditioner):
     """The python PC; see the module and `Options`. It works on symmetric positive definite Mats of type AIJ, BAIJ,
     SBAIJ or dense with blocks of any size, and on shells of this project, of which it knows the diagonal blocks alone.
 
@@ -64,26 +64,19 @@ class BlockICC(Context):
     name = "pctt.pc.BlockICC"  #: for ``-pc_python_type``
     options_class = Options
     options_prefix = "pc_bic_"
-    without = PETSc.PC.Type.NONE
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
         compile_loops()
-        self.options, self.prefix = Options(), ""
         self.factor: Factor | None = None
-        self.places = Places()
         self._layout: Blocks | None = None
         self._pattern: tuple[np.ndarray, ...] = ()
         self._shift = 0.0  # with which the last matrix of the same pattern had a factor
-        self._warned: set[str] = set()
-        self._points: np.ndarray | None = None
-        self._on_coordinates = on_coordinates(pc, self._take_points)
         self.setups, self.setup_s = 0, 0.0
         self._fills: list[float] = []  # least and greatest of all set-ups, over the ranks, and the greatest shift
         self._shifts: list[float] = []
 
     def destroy(self, pc: PETSc.PC) -> None:
-        self._on_coordinates = on_coordinates(pc, None)  # the function refers to this context
         self.factor = None
         super().destroy(pc)
 
@@ -91,28 +84,15 @@ class BlockICC(Context):
         """Forget the matrix."""
         self.factor, self._pattern = None, ()
 
-    def _take_points(self, points: np.ndarray) -> None:
-        """The points (n, d) of this rank's block rows, from ``PCSetCoordinates``."""
-        self._points, self._pattern = points, ()
+    def forget(self) -> None:
+        self._pattern = ()
 
     # -- set-up ---------------------------------------------------------------------------------------------
-
-    def setFromOptions(self, pc: PETSc.PC) -> None:
-        """Read the options with the prefix of the PC; OptionError for a bad value or a misspelt name."""
-        self.prefix = pc.getOptionsPrefix() or ""
-        prefix = self.prefix + self.options_prefix
-        self.options = read(Options, given_options(Options, prefix), prefix)
-        if PETSc.Options().hasName("help"):
-            PETSc.Sys.Print("\n".join(map(str, describe(Options, prefix))), comm=pc.comm)
 
     def setUp(self, pc: PETSc.PC) -> None:
         """ValueError on all ranks if the matrix is not square or has no entries, or if places do not fit it. If it is
         not positive definite, the KSP ends with PETSc's reason for a failed preconditioner."""
-        start, (_, P) = time.perf_counter(), pc.getOperators()
-        refuse_unready(self.name, *pc.getOperators())
-        rows, columns = P.getSize()
-        if rows != columns:
-            raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")
+        start, P = time.perf_counter(), self.square(pc)
         comm = P.comm.tompi4py()
         with PETSc.Log.Event("BICSetUp"):
             pattern, values = _pattern_and_values(P)
@@ -125,7 +105,7 @@ class BlockICC(Context):
         set_failed(pc, bool(failure))
         if failure:
             self.factor = None
-            self._warn(comm, f"{failure}: there is no preconditioner")
+            self.warn(comm, f"{failure}: there is no preconditioner")
         else:
             self._fills = [f(self._fills + [fill for _, fill, _ in found]) for f in (min, max)]
             self._shifts = [f(self._shifts + [shift for *_, shift in found]) for f in (min, max)]
@@ -135,7 +115,7 @@ class BlockICC(Context):
     def _begin(self, pc: PETSc.PC, P: PETSc.Mat, pattern: tuple[np.ndarray, ...]) -> None:
         """Take what depends on the pattern of P only; collective."""
         if not is_symmetric(P):
-            self._warn(P.comm.tompi4py(), "the matrix is not symmetric, so a Cholesky factor may be useless")
+            self.warn(P.comm.tompi4py(), "the matrix is not symmetric, so a Cholesky factor may be useless")
         self.places = places_of(P, (pc.getDM(), pc.getOperators()[0].getDM()), self._points)
         size, block, (indptr, indices) = P.getLocalSize()[0], P.getBlockSize(), pattern
         from_rows = len(indptr) == size + 1 and size > 0 and not (block == 3 and _has_blocks(P))
@@ -177,12 +157,6 @@ class BlockICC(Context):
                 return why if found == BAD_PIVOT else full
             shift = max(_RAISED * shift, 1e-3)
 
-    def _warn(self, comm: MPI.Comm, words: str) -> None:
-        """Warn, once in the life of this preconditioner; collective."""
-        if words not in self._warned:
-            self._warned.add(words)
-            warn(comm, f"{self.name}: {words}")
-
     # -- application ----------------------------------------------------------------------------------------
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
@@ -200,13 +174,7 @@ class BlockICC(Context):
 
     # -- words ----------------------------------------------------------------------------------------------
 
-    def view(self, pc: PETSc.PC, viewer: PETSc.Viewer | None = None) -> None:
-        if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII:
-            for line in pc.comm.tompi4py().bcast(self.report()):
-                viewer.printfASCII(f"  {line}\n")
-
     def report(self) -> list[str]:
-        """Lines for ``-ksp_view``."""
         source = self.places.source
         order = "reverse Cuthill-McKee" if source == "nothing" else f"a sweep along the longest extent of {source}"
         return [

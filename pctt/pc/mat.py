@@ -1,18 +1,85 @@
-"""Checks of the Mat that a user gives to a preconditioner, and of the preconditioner."""
+"""The base of the preconditioners; checks of the Mat that a user gives to one, and of the preconditioner."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import block_csr_matrix, symmetric_shell
+from pctt.blocks import block_csr_matrix, refuse_unready, symmetric_shell
 from pctt.mat.entries import diagonal, given, has_entries
+from pctt.mat.order import Places
+from pctt.options import describe, read
+from pctt.petsc import Context, given_options, on_coordinates, warn
 from pctt.tt.conjugate import ConjugateGradients
 from pctt.tt.train import Array
+
+
+class Preconditioner(Context):
+    """What the python PCs of this package share: options, points of the rows, warnings, and what a view shows."""
+
+    name: str  #: for ``-pc_python_type``
+    options_class: type
+    options_prefix: str
+    without = PETSc.PC.Type.NONE
+    forget: Callable[..., None]  #: lets the next set-up begin anew, as for a matrix of another structure
+    report: Callable[..., list[str]]  #: lines for ``-ksp_view``
+
+    def create(self, pc: PETSc.PC) -> None:
+        super().create(pc)
+        self.options: Any = self.options_class()
+        self.prefix = ""
+        self.places = Places()
+        self._given: list[str] = []  # the names of options that are given
+        self._warned: set[str] = set()
+        self._points: np.ndarray | None = None
+        self._on_coordinates = on_coordinates(pc, self._take_points)
+
+    def destroy(self, pc: PETSc.PC) -> None:
+        self._on_coordinates = on_coordinates(pc, None)  # the function refers to this context
+        super().destroy(pc)
+
+    def _take_points(self, points: np.ndarray) -> None:
+        """The points (n, d) of this rank's block rows, from ``PCSetCoordinates``."""
+        self._points = points
+        self.forget()
+
+    def setFromOptions(self, pc: PETSc.PC) -> None:
+        """Read the options with the prefix of the PC, for the next set-up; OptionError for a bad value or a misspelt
+        name."""
+        self.prefix = pc.getOptionsPrefix() or ""
+        prefix = self.prefix + self.options_prefix
+        given = given_options(self.options_class, prefix)
+        self.options, self._given = read(self.options_class, given, prefix), [*given]
+        if PETSc.Options().hasName("help"):
+            PETSc.Sys.Print("\n".join(map(str, describe(self.options_class, prefix))), comm=pc.comm)
+
+    def square(self, pc: PETSc.PC) -> PETSc.Mat:
+        """The Mat of the PC; ValueError on all ranks if it is not ready for use, or not square."""
+        refuse_unready(self.name, *pc.getOperators())
+        P = pc.getOperators()[1]
+        rows, columns = P.getSize()
+        if rows != columns:
+            raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")
+        return P
+
+    def warn(self, comm: MPI.Comm, words: str, kind: str = "") -> None:
+        """Warn, once in the life of this preconditioner; or once of this kind. Collective.
+
+        Python's filter shows a text once, so it names the options' prefix, which tells the solvers of a program apart.
+        """
+        if (kind or words) not in self._warned:
+            self._warned.add(kind or words)
+            warn(comm, f"{self.name}{f' of {self.prefix}' if self.prefix else ''}: {words}")
+
+    def view(self, pc: PETSc.PC, viewer: PETSc.Viewer | None = None) -> None:
+        if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII:
+            for line in pc.comm.tompi4py().bcast(self.report()):
+                viewer.printfASCII(f"  {line}\n")
 
 
 def is_symmetric(P: PETSc.Mat) -> bool:

@@ -11,19 +11,17 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
-from pctt.blocks import block_diagonal, diagonal_matrix, refuse_unready
+from pctt.blocks import block_diagonal, diagonal_matrix
 from pctt.mat.entries import diagonal_blocks, has_entries
-from pctt.mat.order import Places, places_of
-from pctt.options import describe, read
+from pctt.mat.order import places_of
 from pctt.pc.entries_train import EntriesTrain
-from pctt.pc.mat import has_negative_diagonal, negated, replaced_blocks, without_singular
+from pctt.pc.mat import Preconditioner, has_negative_diagonal, negated, replaced_blocks, without_singular
 from pctt.pc.options import Account, Options
 from pctt.pc.sparse_train import SparseTrain
 from pctt.pc.watch import Watch
-from pctt.petsc import Context, given_options, on_coordinates, set_failed, warn
+from pctt.petsc import set_failed
 
 NOT_SYMMETRIC = "the matrix is not symmetric, so a train for its inverse may be useless"
 NOWHERE = (
@@ -47,40 +45,32 @@ SPOILT = {
 }
 
 
-class TensorTrain(Context):
+class TensorTrain(Preconditioner):
     """The python PC; see the module and ``Options``. It works on symmetric positive definite Mats of any block size."""
 
     name = "pctt.pc.TensorTrain"  #: for ``-pc_python_type``
     options_class = Options
     options_prefix = "pc_tt_"
-    without = PETSc.PC.Type.NONE
     made: SparseTrain | EntriesTrain  #: the maker of trains
     sparse_train: type[SparseTrain] = SparseTrain
 
     def create(self, pc: PETSc.PC) -> None:
         super().create(pc)
-        self.options, self.prefix = Options(), ""
-        self._given: list[str] = []  # the names of options that are given
         self.account = Account()
         self.P: PETSc.Mat | None = None  # the matrix, or a copy of it in AIJ; None if it has no rows
         self.rank = 1
         self.sign = 1.0  # -1: the train is that of minus the matrix
         self._turned = False  # whether the solve that is going on gets minus the preconditioner
         self.failed = False  # whether there is no preconditioner, by -pc_tt_fallback none
-        self.places = Places()
         self._structure: tuple | None = None
         self._copy: list[PETSc.Mat] = []  # P, if it is a copy
         self._own: list[PETSc.Object] = []  # block Jacobi and its matrix
-        self._warned: set[str] = set()
         self._refused = False  # whether the last set-up failed
-        self._points: np.ndarray | None = None
         self._last_precision: type = np.float64  # of the last solve
         self._watch: Watch | None = None  # of the solve that is going on
         self._trials = 0.0  # products that the trials of the last set-up have cost, until a solve has counted them
-        self._on_coordinates = on_coordinates(pc, self._take_points)
 
     def destroy(self, pc: PETSc.PC) -> None:
-        self._on_coordinates = on_coordinates(pc, None)  # the function refers to this context
         self.P = None
         _destroy(self._own)
         _destroy(self._copy)
@@ -90,36 +80,22 @@ class TensorTrain(Context):
         """Forget the matrix; keep everything that the next matrix can use."""
         self._structure = self.P = None
 
-    def _take_points(self, points: np.ndarray) -> None:
-        """The points (n, d) of this rank's block rows, from ``PCSetCoordinates``."""
-        self._points = points
+    def forget(self) -> None:
         self._structure = None
 
     # -- set-up ---------------------------------------------------------------------------------------------
 
     def setFromOptions(self, pc: PETSc.PC) -> None:
-        """Read the options with the prefix of the PC; OptionError for a bad value or a misspelt name.
-
-        The next set-up uses them.
-        """
-        self.prefix = pc.getOptionsPrefix() or ""
-        prefix = self.prefix + self.options_prefix
-        given = given_options(Options, prefix)
-        before, self.options, self._given = self.options, read(Options, given, prefix), [*given]
+        before = self.options
+        super().setFromOptions(pc)
         if self.options != before:
-            self._structure = None
-        if PETSc.Options().hasName("help"):
-            PETSc.Sys.Print("\n".join(map(str, describe(Options, prefix))), comm=pc.comm)
+            self.forget()
 
     def setUp(self, pc: PETSc.PC) -> None:
         """ValueError on all ranks if the matrix is not square or has no entries, or if places do not fit it."""
-        _, P = pc.getOperators()
-        refuse_unready(self.name, *pc.getOperators())
-        rows, columns = P.getSize()
-        if rows != columns:
-            raise ValueError(f"{self.name}: the matrix has {rows} rows and {columns} columns; allowed is a square one")
-        structure: tuple = (P.handle, rows)
-        if rows == 0:
+        P = self.square(pc)
+        structure: tuple = (P.handle, P.getSize()[0])
+        if P.getSize()[0] == 0:
             self.P, self._structure = None, structure
             return
         if not has_entries(P):
@@ -156,7 +132,7 @@ class TensorTrain(Context):
         except PETSc.Error:
             allowed = "aij, baij, sbaij, dense, any Mat with the attribute entries, or at least MatGetDiagonal"
             raise ValueError(f"{self.name}: {what}; allowed are {allowed}") from None
-        self._warn(P.comm.tompi4py(), f"{what}: its diagonal is used")
+        self.warn(P.comm.tompi4py(), f"{what}: its diagonal is used")
         return diagonal_matrix(diagonal)
 
     def _begin(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
@@ -172,15 +148,6 @@ class TensorTrain(Context):
         self.made = made
         made.begin(P, self.places)
 
-    def _warn(self, comm: MPI.Comm, words: str, kind: str = "") -> None:
-        """Warn, once in the life of this preconditioner; or once of this kind. Collective.
-
-        Python's filter shows a text once, so it names the options' prefix, which tells the solvers of a program apart.
-        """
-        if (kind or words) not in self._warned:
-            self._warned.add(kind or words)
-            warn(comm, f"{self.name}{f' of {self.prefix}' if self.prefix else ''}: {words}")
-
     def update(self, pc: PETSc.PC, P: PETSc.Mat) -> None:
         """Make a train or what the rule prefers to it; if this fails, fall back."""
         start, made, A = time.perf_counter(), self.made, pc.getOperators()[0]
@@ -190,17 +157,17 @@ class TensorTrain(Context):
         if self.sign < 0:
             _destroy(operators)
         if not made.symmetric:
-            self._warn(self.comm, NOT_SYMMETRIC)
+            self.warn(self.comm, NOT_SYMMETRIC)
         for name, why in made.idle.items():
             if (option := f"{self.prefix}{self.options_prefix}{name}") in self._given:
-                self._warn(self.comm, f"-{option} has no effect: {why}")
+                self.warn(self.comm, f"-{option} has no effect: {why}")
         self.failed = bool(made.failure) and self.options.fallback == "none"
         if made.failure and not self._refused:
             takes_over = "there is no preconditioner" if self.failed else f"{made.base} takes over"
             sparse = isinstance(made, SparseTrain)
             lost = sparse and self.places.source == "nothing" and self.options.order == "auto"
             reasons = [f"{made.failure}: {takes_over}", *[NOWHERE] * lost, *[FASTER] * sparse]
-            self._warn(self.comm, "; ".join(reasons))
+            self.warn(self.comm, "; ".join(reasons))
         self._refused = bool(made.failure)
         self._trials = made.cost_estimate.spent if made.cost_estimate is not None else 0.0
         if self.rank == 1 and not self.failed:
@@ -212,7 +179,7 @@ class TensorTrain(Context):
         left = made.left if self.rank > 1 else 0.0
         if left > 0.5:
             words = f"the train of rank {self.rank} leaves {left:.2g} of the matrix or of the residual"
-            self._warn(self.comm, words, "leaves")
+            self.warn(self.comm, words, "leaves")
 
     def _make_block_jacobi(self, P: PETSc.Mat) -> None:
         _destroy(self._own)
@@ -316,7 +283,7 @@ class TensorTrain(Context):
                 again = self.options.fallback == "jacobi"
                 self.account.fall_back(f"{what}, solved again with block Jacobi" if again else what)
                 self.made.note_failure(self.account.last)
-                self._warn(self.comm, self.account.last)
+                self.warn(self.comm, self.account.last)
                 if again:
                     self._solve_again(ksp, b, x)
             elif ksp.getType() not in ("preonly", "richardson"):
@@ -365,14 +332,7 @@ class TensorTrain(Context):
 
     # -- words ----------------------------------------------------------------------------------------------
 
-    def view(self, pc: PETSc.PC, viewer: PETSc.Viewer | None = None) -> None:
-        if viewer is not None and viewer.getType() == PETSc.Viewer.Type.ASCII:
-            lines = ["made for no matrix with rows yet"] if self.P is None else self.report()
-            for line in pc.comm.tompi4py().bcast(lines):
-                viewer.printfASCII(f"  {line}\n")
-
     def report(self) -> list[str]:
-        """Lines for ``-ksp_view``."""
         a, symmetric = self.account, self.P is None or self.made.symmetric
         return [
             f"tensor train: {self._line()}",
