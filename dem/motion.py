@@ -381,12 +381,6 @@ def checked_pose(motion: Prescribed, time: float, position: Floats, orientation:
     return vector(f"position {what}", place), unit_quaternion(f"quaternion {what}", turn)
 
 
-def mean_velocity(motion: Prescribed, time: float, dt: float, position: Floats, orientation: Floats) -> Floats:
-    """Velocity (6,) from `time` to `time + dt` of a body with the given pose at time zero."""
-    pose = position, orientation
-    return velocity_between(checked_pose(motion, time, *pose), checked_pose(motion, time + dt, *pose), dt)
-
-
 def velocity_between(start: Pose, end: Pose, dt: float) -> Floats:
     """Velocity (6,) that takes a body from one of its poses to another in dt [s]."""
     velocity = np.zeros(6)

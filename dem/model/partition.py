@@ -78,26 +78,14 @@ def redistribute(world: World) -> None:
     world.set_grains(grains.take(np.lexsort((grains.id, codes))))
 
 
-def imbalance(world: World) -> float:
-    """Return the greatest load of a rank over the mean load, in contacts plus grains; collective."""
-    greatest, _, mean = _loads(world)
-    return greatest / mean
-
-
 def rebalance(world: World, tolerance: float = 1.05) -> bool:
     """Redistribute if a rank has more than `tolerance` times the mean load of the last search, and the load of the
     heaviest grain beside it, as no cut divides that; say if it did; collective."""
     if world.comm.size == 1:
         return False
-    greatest, heaviest, mean = _loads(world)
-    if greatest <= tolerance * mean + heaviest:
+    load = world.grains.weight + 1.0
+    (total,), (greatest, heaviest) = reduced(world.comm, [load.sum()], [load.sum(), load.max(initial=0.0)])
+    if greatest <= tolerance * (total / world.comm.size) + heaviest:
         return False
     redistribute(world)
     return True
-
-
-def _loads(world: World) -> tuple[float, float, float]:
-    """The greatest load of a rank, the greatest of a grain and the mean load of the ranks; collective."""
-    load = world.grains.weight + 1.0
-    (total,), (greatest, heaviest) = reduced(world.comm, [load.sum()], [load.sum(), load.max(initial=0.0)])
-    return greatest, heaviest, total / world.comm.size

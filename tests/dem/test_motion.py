@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from dem import quaternion
 from dem.model.changes import changes, restore
-from dem.motion import Fixed, Glide, Guided, Oscillation, Path, Rotation, checked_pose, mean_velocity, refuse_ignored
+from dem.motion import Fixed, Glide, Guided, Oscillation, Path, Rotation, checked_pose, refuse_ignored, velocity_between
 from dem.scene import Scene
 from dem.shapes import Box
 from dem.start import new_world
@@ -19,6 +19,11 @@ MOTIONS += [Oscillation((1.0, 2.0, 0.0), 0.3, 4.0, 0.7, start=1.4), Glide((1.0, 
 MOTIONS += [Rotation((0.1, 0.0, 1.0), start=1.4), Rotation((0.1, 0.0, 1.0), end=1.4)]
 MOTIONS += [Oscillation((1, 0, 0), 1, 1, end=1.4)]
 MOTIONS += [Path((0.5, 1.4, 2.0), ((1, 1, 1), (2, 0, 1), (2, 0, 3)))]
+
+
+def mean_velocity(motion, time, dt, *pose):
+    """Velocity (6,) from a time to dt later of a body with the given pose at time zero."""
+    return velocity_between(checked_pose(motion, time, *pose), checked_pose(motion, time + dt, *pose), dt)
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
