@@ -118,10 +118,16 @@ def half_thickness(kind: Ints, size: Floats) -> Floats:
     `dem.shapes.placed` [m]; of a mesh into the box about it."""
     half = np.empty(len(kind))
     for n in range(len(kind)):
-        half[n] = size[n, 2] if kind[n] >= FORM else size[n, 0]
-        if kind[n] == BOX or kind[n] == MESH:
-            half[n] = min(size[n, 0], size[n, 1], size[n, 2])
+        half[n] = half_of(kind[n], size[n])
     return half
+
+
+@inlined
+def half_of(kind, size):
+    """The same of one shape."""
+    if kind in (BOX, MESH):
+        return min(size[0], size[1], size[2])
+    return size[2] if kind >= FORM else size[0]
 
 
 def turning(bodies: Bodies) -> Floats:

@@ -11,9 +11,8 @@ import numpy as np
 from mpi4py import MPI
 
 from dem.arrays import Bools, Floats, Ints
-from dem.bodies import FORM
 from dem.measures.images import images
-from dem.shapes import solid
+from dem.shapes import volumes
 from dem.together import barrier
 
 Measure = TypeVar("Measure", bound=Callable[..., Any])
@@ -70,14 +69,7 @@ class Sample:
     @property
     def volume(self) -> Floats:
         """Volumes (n,) of the grains [m^3]."""
-        out = np.zeros(len(self.shape))
-        for kind in np.unique(self.shape):
-            rows = self.shape == kind
-            if kind >= FORM:
-                out[rows] = 4.0 / 3.0 * np.pi * self.size[rows, 1] ** 3
-            else:
-                out[rows] = solid(int(kind), self.size[rows], np.ones(rows.sum()))[0]
-        return out
+        return volumes(self.shape, self.size)
 
 
 def measure(function: Measure) -> Measure:

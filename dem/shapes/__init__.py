@@ -10,7 +10,7 @@ from typing import Any, Union, get_args
 import numpy as np
 
 from dem import quaternion
-from dem.arrays import Floats
+from dem.arrays import Floats, Ints
 from dem.bodies import BOX, CAPSULE, CONVEX, MESH, PLANE, SPHERE, enclosing_radius
 from dem.checks import check_fields, finite, positive, rows, unit_quaternion, unit_vector, vector
 from dem.mesh import Mesh
@@ -157,6 +157,15 @@ def solid(kind: int, size: Floats, density: Floats) -> tuple[Floats, Floats]:
     lateral = moment + ball * (half_length**2 + 0.75 * half_length * radius)
     lateral += cylinder * (radius**2 / 4.0 + half_length**2 / 3.0)
     return ball + cylinder, np.stack([lateral, lateral, axial], axis=1)
+
+
+def volumes(kind: Ints, size: Floats) -> Floats:
+    """Return the volumes (n,) of grains of kinds (n,) and sizes (n, 3), as of `Bodies` [m^3]."""
+    out = 4.0 / 3.0 * np.pi * size[:, 1] ** 3
+    for each in (SPHERE, BOX, CAPSULE):
+        rows = kind == each
+        out[rows] = solid(each, size[rows], np.ones(int(rows.sum())))[0]
+    return out
 
 
 def solid_properties(shape: Shape, density: float) -> tuple[float, Floats, Floats]:

@@ -93,20 +93,12 @@ def _bed(scene: Scene, along: Floats, every: Bodies) -> tuple[float, float, floa
     layers, as in a cubic lattice of their solid fraction [m]; their mass over the area of the box about them
     [kg/m^2]."""
     grains = scene.survey()
-    volume, radius = grains.mass / float(_density(every).max()), grains.radius / grains.count
+    density = float((every.mass / shapes.volumes(every.shape, every.size)).max())
+    volume, radius = grains.mass / density, grains.radius / grains.count
     wide = grains.high - grains.low + 2.0 * radius
     pitch = max((CUBIC * wide.prod() / volume) ** (1.0 / 3.0), 1.0)
     column = grains.mass / float(np.abs(along) @ (wide[[1, 2, 0]] * wide[[2, 0, 1]]))
     return volume / (area(scene, along) * DENSE), 2.0 * radius * (pitch - 1.0), column
-
-
-def _density(grains: Bodies) -> Floats:
-    """Densities (n,) of grains [kg/m^3]."""
-    volume = 4.0 / 3.0 * np.pi * grains.size[:, 1] ** 3
-    for kind in (bodies.SPHERE, BOX, CAPSULE):
-        rows = grains.shape == kind
-        volume[rows] = shapes.solid(kind, grains.size[rows], np.ones(int(rows.sum())))[0]
-    return grains.mass / volume
 
 
 def _corners(low: Floats, high: Floats) -> Floats:

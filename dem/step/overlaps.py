@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dem.arrays import Floats, Ints
-from dem.bodies import BOX, COMPOUND, FORM
-from dem.compiled import inlined, loop
+from dem.bodies import COMPOUND, half_of
+from dem.compiled import loop
 from dem.exchange import reduced
 
 if TYPE_CHECKING:
@@ -42,18 +42,12 @@ def deepest(
             left -= linear[c] * (1.0 - stiffness[c] * dt**2 * compliance[c])
         if gap[c] >= 0.0 and left <= 0.0:
             continue
-        half = min(_half(shape[a[c]], size[a[c]]), _half(shape[b[c]], size[b[c]]))
+        half = np.inf
+        for n in (a[c], b[c]):
+            if shape[n] != COMPOUND:
+                half = min(half, half_of(shape[n], size[n]))
         if half == np.inf:
             half = min(large[a[c] - first], large[b[c] - first])
         start, held = max(start, -gap[c] / half), max(held, left / half)
     return start, held
 
-
-@inlined
-def _half(shape, size):
-    """The half thickness of a grain, as `dem.bodies.least_half_thickness`; inf of large bodies."""
-    if shape == COMPOUND:
-        return np.inf
-    if shape == BOX:
-        return min(size[0], size[1], size[2])
-    return size[2] if shape >= FORM else size[0]

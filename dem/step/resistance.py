@@ -37,9 +37,8 @@ def resistance(
     if met is None or (moments := world.pairs.moments(met)) is None:
         return None
     table, a, b = contacts.near.bodies, contacts.a, contacts.b
-    mobility = 1.0 / table.mass[a] + 1.0 / table.mass[b]
     turns = (1.0 / table.inertia[a] + 1.0 / table.inertia[b]).mean(axis=1)
-    length = np.sqrt(np.divide(mobility, turns, out=np.ones(len(a)), where=(turns > 0.0) & (mobility > 0.0)))
+    length = np.sqrt(np.divide(met.mobility, turns, out=np.ones(len(a)), where=(turns > 0.0) & (met.mobility > 0.0)))
     turn = (frame * length[:, None, None]).reshape(-1, 9)
     G = TurningMap(known.comm, known.source, turn, known.halo, known.body, mass=known.mass)
     tangents, normals = (values / length for values in moments)
