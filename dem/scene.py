@@ -445,7 +445,9 @@ class Scene:
         else:
             raise ValueError(f"dynamic body {name!r} needs either its density or both mass and inertia")
         if isinstance(motion, Hinged):
-            _refuse_beside_hinge(body, motion.line, body.position - place)
+            arm = body.position - place
+            if length(np.cross(motion.line, arm)) > 1e-6 * max(length(arm), np.sqrt(body.inertia.max() / body.mass)):
+                raise ValueError(f"{name!r} is hinged: its centre of mass must be on the axis through its position")
         if isinstance(motion, Dynamic):
             body = _turning(body, motion)
         body = replace(body, surface=checked_surface(name, surface_velocity))
@@ -848,12 +850,6 @@ def _centered(body: LargeBody, density: float) -> LargeBody:
     mass, center, tensor = shapes.mass_properties(body.shapes, density)
     moments, turn = quaternion.principal(tensor)
     return replace(_reframed(body, center, turn), mass=mass, inertia=moments, density=density)
-
-
-def _refuse_beside_hinge(body: LargeBody, axis: Floats, arm: Floats) -> None:
-    """ValueError if the centre of mass of a body, at `arm` (3,) from a point of its hinge, is not on the axis (3,)."""
-    if length(np.cross(axis, arm)) > 1e-6 * max(length(arm), np.sqrt(body.inertia.max() / body.mass)):
-        raise ValueError(f"{body.name!r} is hinged: its centre of mass must be on the axis through its position")
 
 
 def _turning(body: LargeBody, motion: Dynamic) -> LargeBody:

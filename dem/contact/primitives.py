@@ -152,7 +152,9 @@ def primitives(
     kinds, centers, turns, sizes = zip(*(placed(shape) for shape in parts_of)) if parts_of else [()] * 4
     numbers = [forms.index(centred(shape)) if isinstance(shape, Convex) else 0 for shape in parts_of]
     center, turn, size = (np.reshape(c, (len(row), k)) for c, k in ((centers, 3), (turns, 4), (sizes, 3)))
-    spans = [numbers_of(shape, hulls.features) for shape in parts_of]
+    # that features may be distinct, of which polyhedra have the most but for meshes
+    meshes = [NAMES * shape.surface.features if isinstance(shape, Mesh) else 1 for shape in parts_of]
+    spans = [1 + (most - 1) // hulls.features for most in meshes]
     columns = {
         "number": (table.id, grains + np.cumsum([0, *spans])[:-1]),
         "row": (np.arange(count), row),
@@ -186,11 +188,6 @@ def most_numbers(features: int) -> int:
     return 2**53 // features
 
 
-def is_round(kind: Ints) -> Bools:
-    """Which shapes of kinds (n,) are round."""
-    return (kind == SPHERE) | (kind == CAPSULE) | (kind >= CONVEX)
-
-
 def extents(shapes: list[tuple[Shape, ...]]) -> Floats:
     """Distances (large,) of the furthest points of large bodies from their reference points [m]; half spaces, which
     have none, count with a metre."""
@@ -200,11 +197,6 @@ def extents(shapes: list[tuple[Shape, ...]]) -> Floats:
         return float(np.linalg.norm(center) + enclosing_radius(np.array([kind]), size[None])[0])
 
     return np.array([max(extent(shape) for shape in parts) for parts in shapes])
-
-
-def numbers_of(shape: Shape, features: int) -> int:
-    """How many numbers a part takes, that its features may be distinct: polyhedra have the most but for meshes."""
-    return 1 + (NAMES * shape.surface.features - 1) // features if isinstance(shape, Mesh) else 1
 
 
 def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course | None = None) -> Manifold:
@@ -272,7 +264,7 @@ def at_start(
         return none
     kind, part = table.kind, table.row >= grains
     given = part & (kind != PLANE) & ~course.moves[table.row]
-    rolls = part & is_round(kind)
+    rolls = part & ((kind == SPHERE) | (kind == CAPSULE) | (kind >= CONVEX))
     if not (given.any() or rolls.any()):
         return none
     guest, host, swap = guests_and_hosts(kind, i, j, found.pair)

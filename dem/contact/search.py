@@ -127,17 +127,13 @@ def branches(a: Ints, b: Ints, position: Floats, moved: Floats) -> Floats:
     return out
 
 
+@loop
 def contact_frames(normal: Floats) -> Floats:
     """Return orthonormal right-handed frames (nc, 3, 3), rows n, t1, t2, of unit normals (nc, 3).
 
     Duff et al. (2017), "Building an Orthonormal Basis, Revisited": a function of the normal alone, continuous
     but where the sign of its z component changes.
     """
-    return _frames(normal).reshape(-1, 3, 3)
-
-
-@loop
-def _frames(normal: Floats) -> Floats:
     out = np.empty((len(normal), 9))
     for c in range(len(normal)):
         x, y, z = normal[c, 0], normal[c, 1], normal[c, 2]
@@ -147,7 +143,7 @@ def _frames(normal: Floats) -> Floats:
         out[c, 0], out[c, 1], out[c, 2] = x, y, z
         out[c, 3], out[c, 4], out[c, 5] = 1.0 + sign * x * x * p, sign * q, -sign * x
         out[c, 6], out[c, 7], out[c, 8] = q, sign + y * y * p, -y
-    return out
+    return out.reshape((len(normal), 3, 3))
 
 
 def find_contacts(
@@ -206,7 +202,7 @@ def _margins(
 def _that_touch(world: World, near: Neighbourhood, table: Primitives, pairs: Pairs) -> Pairs:
     """The pairs of materials that touch each other, and of bodies that are not `World.apart`."""
     i, j, reach = pairs
-    if not world.pairs.all_touch:
+    if not world.pairs.touching.all():
         material = near.bodies.material[table.row]
         touch = world.pairs.touching[material[i], material[j]] > 0.0
         i, j, reach = i[touch], j[touch], reach[touch]

@@ -163,7 +163,8 @@ def changes(world: World) -> str:
         if kind == "body":
             entry = _entry(world.large_bodies[world.large_row(name)])
         elif kind == "pair":
-            entry = contact_law.of_pair(world.pairs, *_pair(world, name))
+            i, j = _pair(world, name)
+            entry = {key: float(getattr(world.pairs, key)[i, j]) for key in contact_law.CHANGED}
         else:
             part = world.named[kind][name]
             entry = {key: getattr(part, key) for key in part.KEPT}

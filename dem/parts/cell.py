@@ -207,11 +207,6 @@ class Cell(Named):
             out[0, self.gradient] = (self.shift - out[0, 0] * then.shift) / then.period[self.gradient]
         return out, 1.0 - float(np.linalg.svd(out, compute_uv=False)[-1])
 
-    def given_rates(self, time: float, dt: float) -> Floats:
-        """Rates (3,) at which the periods are to grow in the step of dt [s] from the `time` [s]; NaN: what the asked
-        stress needs, or none [1/s]."""
-        return -self.strain_rate if time >= self.start - 1e-6 * dt else np.full(3, np.nan)
-
     def needs(self, grains: Bodies) -> dict[str, float]:
         """The time steps [s] that the motion of the cell and its stress need, by what needs them, for these grains."""
         found = {}

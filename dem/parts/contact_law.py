@@ -63,11 +63,6 @@ class ContactLaw(Rolling, StaticFriction, Bridges, Cohesion):
         return bool(self.restitution.any())
 
     @cached_property
-    def all_touch(self) -> bool:
-        """Whether bodies of all pairs touch each other."""
-        return bool(self.touching.all())
-
-    @cached_property
     def attracts(self) -> bool:
         """Whether bodies of any pair attract each other."""
         return bool(self.strongest(np.ones(1)) > 0.0)
@@ -121,11 +116,6 @@ def law(
     if before is None and "friction" not in given:
         raise ValueError("friction None: allowed is a number >= 0")
     return replace(before, **given) if before else ContactLaw(**given)
-
-
-def of_pair(both: ContactLaw, i: int, j: int) -> dict[str, float]:
-    """Return the coefficients of the materials i and j of tables that a run may change, by name."""
-    return {name: float(getattr(both, name)[i, j]) for name in CHANGED}
 
 
 def changed(both: ContactLaw, i: int, j: int, values: Mapping[str, float]) -> ContactLaw:

@@ -52,7 +52,7 @@ def needs(scene: Scene) -> dict[str, float]:
     found |= {what: _rounded(dt) for what, dt in scene.cell.needs(scene.expected()).items()}
     if (spin := fastest_turn(scene)) > 0.0:
         found[f"bodies that turn at {spin:.3g} rad/s"] = _rounded(TURN / spin)
-    if (swings := fastest_swing(scene)) > 0.0:
+    if (swings := max((swing(body, for_settling(scene)) for body in _staying(scene)), default=0.0)) > 0.0:
         found[f"tools that swing with {swings:.3g} rad/s"] = _rounded(TURN / swings)
     if (toppled := toppling(scene)).dt < np.inf:
         found[f"bodies that topple to {toppled.turn.max():.3g} rad/s"] = _rounded(toppled.dt)
@@ -91,7 +91,8 @@ def falling(scene: Scene, pressed: Pressing) -> float:
 
 def for_settling(scene: Scene) -> float:
     """Return the time step [s] in which grains fall and come to rest; 0.01 s without gravity."""
-    return _rounded(FALLING * _fall(scene))
+    gravity = math.hypot(*scene.gravity)
+    return _rounded(FALLING * (float(np.sqrt(smallest(scene) / gravity)) if gravity > 0.0 else 0.1))
 
 
 def contact_distance(scene: Scene) -> float:
@@ -139,19 +140,8 @@ def fastest_turn(scene: Scene) -> float:
     return float(np.concatenate([grains, large, *held]).max(initial=0.0))
 
 
-def fastest_swing(scene: Scene) -> float:
-    """Return the greatest angular frequency of a tool that stays with the grains [rad/s]."""
-    return max((swing(body, for_settling(scene)) for body in _staying(scene)), default=0.0)
-
-
 def _staying(scene: Scene) -> list[LargeBody]:
     return [body for body in scene.large_bodies if body.name not in scene.leaving]
-
-
-def _fall(scene: Scene) -> float:
-    """sqrt(R / g) [s], in which a grain falls half its radius; 0.1 s without gravity."""
-    gravity = math.hypot(*scene.gravity)
-    return float(np.sqrt(smallest(scene) / gravity)) if gravity > 0.0 else 0.1
 
 
 def _top_speed(body: LargeBody, about: bool, step: float) -> float:

@@ -170,7 +170,8 @@ class SwingWatch:
         if len(self._seen) < WINDOW:
             return ""
         seen, self._seen = self._seen, []
-        rows = [row for row, body in enumerate(world.large_bodies) if _may_swing(body)]
+        rows = [row for row, body in enumerate(world.large_bodies)
+                if isinstance(body.motion, (Oscillation, Path)) or _is_own(body)]  # fmt: skip
         if not rows:
             return ""
         velocity = np.array(seen)[:, rows].reshape(WINDOW, -1, 2, 3)
@@ -184,7 +185,3 @@ class SwingWatch:
                 f"in a step; take at most {TURN / w:.2g} s"
             )
         return ""
-
-
-def _may_swing(body: LargeBody) -> bool:
-    return isinstance(body.motion, (Oscillation, Path)) or _is_own(body)
