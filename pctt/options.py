@@ -49,6 +49,18 @@ AT_LEAST_ONE = ("a whole number >= 1", lambda x: x >= 1)
 COUNT = ("a whole number >= 0", lambda x: x >= 0)
 
 
+def word_or_number(word: str, test: Callable[[float], bool]) -> Callable[[str], bool]:
+    """Return the test of a text that it is a word, or a number that passes a test."""
+
+    def passes(text: str) -> bool:
+        try:
+            return text == word or test(float(text))
+        except ValueError:
+            return False
+
+    return passes
+
+
 @dataclasses.dataclass(frozen=True)
 class Description:
     """One option as ``-help`` shows it."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -262,7 +262,9 @@ class Simulation:
             warn(self.comm, report.jump_words(self.figures, self._program))
         if cause := self.overlap_watch.look(made.step, self.figures["closing_speed"]):
             warn(self.comm, self.overlap_watch.words(cause, self.steps, self._program))
-        self._tell_unsolved()
+        if not self._unsolved and self.figures["status"] not in report.SOLVED:
+            self._unsolved = True
+            warn(self.comm, report.unsolved_words(self.figures))
         self._tell_turns()
         return self.figures
 
@@ -285,12 +287,6 @@ class Simulation:
             with log.phase("output"):
                 output.add(figures, self._row)
         self.figures = self._row | figures
-
-    def _tell_unsolved(self) -> None:
-        """Warn of the first step that is not solved; collective."""
-        if not self._unsolved and self.figures["status"] not in report.SOLVED:
-            self._unsolved = True
-            warn(self.comm, report.unsolved_words(self.figures))
 
     def _tell_turns(self) -> None:
         """Warn of a body that goes, turns or swings too far in a step, or of a joint that does not hold; collective."""
@@ -484,14 +480,10 @@ class Simulation:
         self._refuse_closed("change")
         together(self.comm, what, partial(refuse_functions, what, values), own=(ValueError,))
         values = self.comm.bcast(values)
-        self._refuse_steep({name: values[name] for name in ("friction", "static_friction") if name in values})
-        together(self.comm, what, partial(change, self.world, what, **values), own=(ValueError, TypeError))
-
-    def _refuse_steep(self, friction: Mapping[str, float]) -> None:
-        """ValueError for coefficients that the tolerance does not allow."""
-        for name, given in friction.items():
-            if self.settings.law == ccp.COULOMB and (steep := ccp.why_steep(number(name, given), self.settings.tol)):
+        for name in ("friction", "static_friction") if self.settings.law == ccp.COULOMB else ():
+            if name in values and (steep := ccp.why_steep(number(name, values[name]), self.settings.tol)):
                 raise ValueError(f"{name} {steep}")
+        together(self.comm, what, partial(change, self.world, what, **values), own=(ValueError, TypeError))
 
     @property
     def period(self) -> Floats | None:

@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from pctt.blocks import shell_of
 from pctt.mat.order import places_of
-from pctt.options import option
+from pctt.options import option, word_or_number
 from pctt.pc.incomplete_cholesky import BAD_BLOCK, BAD_PIVOT, MOST, Array, Blocks, Factor, compile_loops, factorised
 from pctt.pc.mat import Preconditioner, is_symmetric
 from pctt.petsc import block_values, set_failed
@@ -32,13 +32,6 @@ from pctt.petsc import block_values, set_failed
 _RAISED = 2.0  # factor on a shift with which a pivot was bad
 _GREATEST = 16.0  # shift: a matrix that is scaled by its diagonal blocks has hardly any off them beside it
 _TILT = np.array([1.0, 0.3, 0.1])  # of the sweep, by the extents of the points: rows of a lattice are not equal
-
-
-def _is_shift(text: str) -> bool:
-    try:
-        return text == "auto" or 0.0 <= float(text) <= 1e6  # entries are about one, in single precision
-    except ValueError:
-        return False
 
 
 @dataclass(frozen=True)
@@ -51,7 +44,8 @@ class Options:
     )
     shift: str = option(
         "auto", "added to the diagonal of the scaled matrix; auto: half of tau, and twice as much whenever a pivot is "
-        "not positive", check=("auto or a number from 0 to 1e6", _is_shift),
+        "not positive",
+        check=("auto or a number from 0 to 1e6", word_or_number("auto", lambda x: 0.0 <= x <= 1e6)),
     )  # fmt: skip
 
 

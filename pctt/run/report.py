@@ -64,11 +64,6 @@ def remedy(field: str, program: bool) -> str:
     return f"a {'larger' if field == 'stiffness' else 'smaller'} {option_name(field, program)}"
 
 
-def dt_line(dt: float, reason: str) -> str:
-    """What the time step [s] was chosen for."""
-    return f"dt {dt:g} s, for {reason}; -dt takes another"
-
-
 def stiffness_line(stiffness: np.ndarray, overlap: float, steps: float) -> str:
     """The stiffnesses [N/m] of contacts, and the parts of a half thickness that bodies may overlap by as springs, and
     by the length of steps."""
@@ -194,7 +189,9 @@ def ending(
     `OverlapWatch`."""
     outside = steps[-1]["record"].get("grains_outside")
     said = [phase_table(steps), law_line(steps, tol), jumps_line(steps), forces_line(steps, closing_work)]
-    said += [figure_table(figures), overlap_line(worst, cause)]
+    width = max(map(len, figures), default=0)
+    said += [f"{name:{width}}  {value + 0.0:.6g}" for name, value in figures.items()]
+    said += [overlap_line(worst, cause)]
     said += [f"{outside:.0f} grains have left the domain of the scene"] if outside else []
     return "\n".join(filter(None, said))
 
@@ -278,9 +275,3 @@ def overlap_line(worst: Mapping[str, float], cause: str = "dt") -> str:
     if overlap <= LARGE_OVERLAP * radius:
         return line
     return f"WARNING: {line}; try {remedy(cause or 'dt', True)}"
-
-
-def figure_table(figures: Mapping[str, float]) -> str:
-    """A line per number of the scene's analysis."""
-    width = max(map(len, figures), default=0)
-    return "\n".join(f"{name:{width}}  {value + 0.0:.6g}" for name, value in figures.items())

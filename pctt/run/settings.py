@@ -31,19 +31,13 @@ from pctt.options import (
     number,
     option,
     refuse_bad,
+    word_or_number,
 )
 from pctt.scenes import SCENES
 
 #: By how much a contact may close in a step beyond what its spring gives, as a part of the contact distance.
 CLOSING = 0.15
 RELAX = "relax"  #: a value of the option -overlap
-
-
-def _is_overlap(text: str) -> bool:
-    try:
-        return text == RELAX or NOT_NEGATIVE[1](float(text))
-    except ValueError:
-        return False
 
 
 # options of PETSc and of preconditioners in the demo
@@ -124,7 +118,7 @@ class Settings(ccp.Limits):
         "0.01",
         "greatest overlap of bodies at the start, over half the thickness of the thinner one; relax: any, and they are "
         "pushed apart before the first step, without a speed",
-        check=("a number >= 0, or relax", _is_overlap),
+        check=("a number >= 0, or relax", word_or_number(RELAX, NOT_NEGATIVE[1])),
         name="overlap",
     )
     options: Any = number(None, "options of the solver, an instance of its class or a dict of its fields")

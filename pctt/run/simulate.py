@@ -69,7 +69,7 @@ def _make_steps(options: Options, sim: Simulation, progress: report.Progress, co
     end = sim.steps + steps
     progress.say(f"{sim.world.body_count} bodies on {sim.comm.size} ranks, {settings.words}")
     if sim.dt_reason:
-        progress.say(report.dt_line(settings.dt, sim.dt_reason))
+        progress.say(f"dt {settings.dt:g} s, for {sim.dt_reason}; -dt takes another")
     watch = sim.overlap_watch
     progress.say(report.stiffness_line(sim.world.pairs.stiffness, watch.elastic, watch.steps))
     if "recovery_speed" in options.given and np.isfinite(sim.world.pairs.stiffness).all():

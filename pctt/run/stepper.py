@@ -167,7 +167,9 @@ class Stepper:
     ) -> tuple[Array, Callable[[], _Attempt] | None]:
         """The velocities (owned, 6) of a solution, and what makes the next attempt if they show that the problem lacks
         something; collective. No result is kept for it: it takes memory while others are made."""
-        if not attempt.smooth and _locks(world, result):
+        # no impulses let bodies bounce as they are to: in a corner friction may press one on a wall as fast as another
+        # sends it off
+        if not attempt.smooth and result.status is ccp.Status.UNBOUNDED and world.pairs.bounces:
             return np.zeros((0, 6)), partial(replace, attempt, free=system.motion, smooth=True, before=result.cost)
         other = less = None
         with log.phase("search"):  # bodies that meet unforeseen
@@ -212,7 +214,8 @@ class Stepper:
             limits = rest.limits_of(self._limits, world, system)
             result = self._by(problem, guess, limits, self.newton)
             rest.account(world, limits, result)
-            result = rest.with_islands(world, system, problem, guess, limits, self._by_itself, result)
+            of_parts = partial(self._by, newton=None if self.newton is None else self.newton.of_parts)
+            result = rest.with_islands(world, system, problem, guess, limits, of_parts, result)
         return result if before is None else result.after(before)
 
     def _by(
@@ -221,10 +224,6 @@ class Stepper:
         """What the method of the settings makes of a problem."""
         settings = self.settings
         return ccp.solved(problem, guess, settings.solver, limits, settings.options, newton, settings.law)
-
-    def _by_itself(self, problem: ccp.ConeProblem, guess: Array, limits: ccp.Limits) -> ccp.Result:
-        """The same of a part of the problem of a step."""
-        return self._by(problem, guess, limits, None if self.newton is None else self.newton.of_parts)
 
     def _missed(
         self, world: World, system: ContactSystem, velocity: Array, turned: int
@@ -299,12 +298,6 @@ def _remembered(world: World, system: ContactSystem, found: ccp.Result) -> Impul
     memory = ImpulseMemory(world.comm, world.pairs.parts)
     memory.remember(system.key, found.impulse, system.frame)
     return memory
-
-
-def _locks(world: World, result: ccp.Result) -> bool:
-    """Whether no impulses let bodies bounce as they are to, so that their impacts are to be without friction: in a
-    corner it may press a body on one wall as fast as the other sends it off."""
-    return result.status is ccp.Status.UNBOUNDED and world.pairs.bounces
 
 
 def _refuse_squeezed(world: World, result: ccp.Result) -> None:

@@ -63,10 +63,8 @@ class Cones(ABC):
     @property
     def first_tangents(self) -> Array:
         """The coefficient of the second number of each row (rows,): where it is zero, so are the second and third."""
-        return np.concatenate([self.coefficients[self._part_of(3 * row + 1)] for row in range(self.parts)])
-
-    def _part_of(self, number: int) -> int:
-        return next(k for k, part in enumerate(self.tangents) if number in part)
+        part_of = {number: k for k, part in enumerate(self.tangents) for number in part}
+        return np.concatenate([self.coefficients[part_of[3 * row + 1]] for row in range(self.parts)])
 
     def joined(self, x: Array) -> Array:
         """The numbers (count, width) of each contact, of rows (rows, 3)."""

@@ -42,18 +42,13 @@ def end_of(
         return Status.CONVERGED, limits.met
     if len(history) > limits.max_it:
         return Status.ITERATION_LIMIT, f"{limits.max_it} Newton steps"
-    return (Status.BREAKDOWN, INDEFINITE) if is_indefinite(problem, dg, dy) else None
+    curvature, square = problem.sum(np.array([np.vdot(dg, dy), np.vdot(dg, dg)]))
+    return (Status.BREAKDOWN, INDEFINITE) if curvature < -1e-10 * problem.mean_diagonal * square else None  # rounding
 
 
 def no_step(length: float, words: str) -> tuple[Status, str]:
     """The end of a method that has found no step of a useful length."""
     return (Status.STALLED, words) if length == length else (Status.BREAKDOWN, "not a number in the Newton step")
-
-
-def is_indefinite(problem: ConeProblem, dg: Array, dy: Array) -> bool:
-    """Whether dg'N dg < 0 beyond rounding, for the velocities dy = N dg that a step dg (nc, 3) changes."""
-    curvature, square = problem.sum(np.array([np.vdot(dg, dy), np.vdot(dg, dg)]))
-    return bool(curvature < -1e-10 * problem.mean_diagonal * square)
 
 
 def hold(blocks: Array, free: NDArray[np.bool_], stiff: Array) -> None:
