@@ -335,13 +335,9 @@ class Mesh:
 
     @classmethod
     def read(
-        cls,
-        file: str | Path,
-        scale: float = 1.0,
-        *,
-        center: Sequence[float] = (0.0, 0.0, 0.0),
+        cls, file: str | Path, scale: float = 1.0, *, center: Sequence[float] = (0.0, 0.0, 0.0),
         quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
-    ) -> Mesh:
+    ) -> Mesh:  # fmt: skip
         """From an STL or OBJ file, or another one that trimesh reads; `scale` is the unit of its numbers in metres
         (1e-3: millimetres). Corners in the same place become one vertex.
 
@@ -378,13 +374,9 @@ class Mesh:
 
     @classmethod
     def revolved(
-        cls,
-        profile: Sequence[Sequence[float]],
-        sides: int = 64,
-        *,
-        center: Sequence[float] = (0.0, 0.0, 0.0),
+        cls, profile: Sequence[Sequence[float]], sides: int = 64, *, center: Sequence[float] = (0.0, 0.0, 0.0),
         quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
-    ) -> Mesh:
+    ) -> Mesh:  # fmt: skip
         """A profile, places (k, 2) of radius and z [m] from point to point, turned about the z axis with `sides` flat
         sides: a drum, a silo, a funnel, a wheel. The corners are on the circles.
 

@@ -52,14 +52,9 @@ def uniform(low: float, high: float, shape: tuple[int, ...], seed: int) -> Rule:
 
 
 def random_packing(
-    lengths: Sequence[float],
-    radius: float | Sequence[float] | Sizes,
-    fraction: float,
-    *,
-    periodic: Sequence[bool] = (False, False, False),
-    seed: int = 0,
-    most: int = 20000,
-) -> tuple[Floats, Floats]:
+    lengths: Sequence[float], radius: float | Sequence[float] | Sizes, fraction: float, *,
+    periodic: Sequence[bool] = (False, False, False), seed: int = 0, most: int = 20000,
+) -> tuple[Floats, Floats]:  # fmt: skip
     """Return centres (n, 3) and radii (n,) [m] of spheres without overlaps in the box from zero to the `lengths` (3,)
     [m], with at least this solid `fraction`: up to about 0.6 where all axes are periodic. Walls leave more room between
     spheres: equal ones reach 0.50 in a box of 10 radii, 0.55 in one of 20, 0.58 in one of 40.

@@ -184,18 +184,11 @@ class Scene:
     simulation was made stays as it is; `copy` makes one that can be changed."""
 
     def __init__(
-        self,
-        friction: float,
-        gravity: Sequence[float] = (0.0, 0.0, -9.81),
-        *,
-        period: Sequence[float | None] | None = None,
-        shear_rate: float | None = None,
-        shear_gradient: str = "y",
-        stress: Sequence[float | None] | None = None,
-        strain_rate: Sequence[float | None] | None = None,
-        strain_start: float = 0.0,
-        **law: float | None,
-    ) -> None:
+        self, friction: float, gravity: Sequence[float] = (0.0, 0.0, -9.81), *,
+        period: Sequence[float | None] | None = None, shear_rate: float | None = None, shear_gradient: str = "y",
+        stress: Sequence[float | None] | None = None, strain_rate: Sequence[float | None] | None = None,
+        strain_start: float = 0.0, **law: float | None,
+    ) -> None:  # fmt: skip
         """`gravity`: (3,) [m/s^2]. `friction` and the `law`, such as `stiffness`, `restitution` or `cohesion`, are the
         coefficients of the contacts of all pairs of materials, but of those of `set_pair`: the fields of
         `dem.parts.contact_law.ContactLaw`, see docs/contact_laws.md.
@@ -263,15 +256,9 @@ class Scene:
 
     @_building
     def add_spheres(
-        self,
-        positions: ArrayLike,
-        radius: ArrayLike,
-        density: ArrayLike,
-        *,
-        material: str | Sequence[str] = "default",
-        velocity: ArrayLike = (0.0, 0.0, 0.0),
-        angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> Ints | range:
+        self, positions: ArrayLike, radius: ArrayLike, density: ArrayLike, *, material: str | Sequence[str] = "default",
+        velocity: ArrayLike = (0.0, 0.0, 0.0), angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Ints | range:  # fmt: skip
         """Add solid spheres and return their ids (n,).
 
         positions (n, 3) [m]; radius [m] and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3); the name
@@ -279,61 +266,41 @@ class Scene:
         makes its part alone; so of other grains. `pctt.beds.read_spheres` has these arguments from a file.
         """
         upright, lengths = (1.0, 0.0, 0.0, 0.0), {"radius": radius}
-        return self._add_grains(SPHERE, positions, lengths, density, material, upright, velocity, angular_velocity)
+        return self._append(SPHERE, positions, lengths, density, material, upright, velocity, angular_velocity)
 
     @_building
     def add_boxes(
-        self,
-        positions: ArrayLike,
-        half_extents: ArrayLike,
-        density: ArrayLike,
-        *,
-        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
-        material: str = "default",
-        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        self, positions: ArrayLike, half_extents: ArrayLike, density: ArrayLike, *,
+        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0), material: str = "default", velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> Ints | range:
+    ) -> Ints | range:  # fmt: skip
         """Add solid boxes and return their ids (n,).
 
         positions (n, 3) and half extents (3,) or (n, 3) [m]; density [kg/m^3] one for all or (n,);
         quaternions (4,) or (n, 4); velocities (3,) or (n, 3).
         """
         lengths = {"half extents": half_extents}
-        return self._add_grains(BOX, positions, lengths, density, material, quaternions, velocity, angular_velocity)
+        return self._append(BOX, positions, lengths, density, material, quaternions, velocity, angular_velocity)
 
     @_building
     def add_capsules(
-        self,
-        positions: ArrayLike,
-        radius: ArrayLike,
-        half_length: ArrayLike,
-        density: ArrayLike,
-        *,
-        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
-        material: str = "default",
-        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        self, positions: ArrayLike, radius: ArrayLike, half_length: ArrayLike, density: ArrayLike, *,
+        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0), material: str = "default", velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> Ints | range:
+    ) -> Ints | range:  # fmt: skip
         """Add solid capsules, along the z axes of their frames, and return their ids (n,).
 
         positions (n, 3) [m]; radius, half length of the core segment [m] and density [kg/m^3] one for all or (n,);
         quaternions (4,) or (n, 4); velocities (3,) or (n, 3).
         """
         lengths = {"radius": radius, "half length": half_length}
-        return self._add_grains(CAPSULE, positions, lengths, density, material, quaternions, velocity, angular_velocity)
+        return self._append(CAPSULE, positions, lengths, density, material, quaternions, velocity, angular_velocity)
 
     @_building
     def add_clumps(
-        self,
-        positions: ArrayLike,
-        shape: Clump,
-        density: ArrayLike,
-        *,
-        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
-        material: str = "default",
-        velocity: ArrayLike = (0.0, 0.0, 0.0),
-        angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> Ints | range:
+        self, positions: ArrayLike, shape: Clump, density: ArrayLike, *, quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        material: str = "default", velocity: ArrayLike = (0.0, 0.0, 0.0), angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Ints | range:  # fmt: skip
         """Add solid clumps of spheres of one shape and return their ids (n,).
 
         positions (n, 3) [m] and quaternions (4,) or (n, 4) are those of the frame in which `shape` has its centres.
@@ -342,22 +309,15 @@ class Scene:
         """
         if not isinstance(shape, Clump):
             raise ValueError(f"shape of clumps: allowed is a Clump, got {type(shape).__name__}")
-        form = clumps.form(shape)
-        return self._add_form(form, positions, density, 1.0, quaternions, material, velocity, angular_velocity)
+        form, scale = clumps.form(shape), {"scale": 1.0}
+        return self._append(form, positions, scale, density, material, quaternions, velocity, angular_velocity)
 
     @_building
     def add_polyhedra(
-        self,
-        positions: ArrayLike,
-        vertices: ArrayLike,
-        density: ArrayLike,
-        *,
-        scale: ArrayLike = 1.0,
-        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
-        material: str = "default",
-        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        self, positions: ArrayLike, vertices: ArrayLike, density: ArrayLike, *, scale: ArrayLike = 1.0,
+        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0), material: str = "default", velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> Ints | range:
+    ) -> Ints | range:  # fmt: skip
         """Add solid convex polyhedra of one shape, the hull of 4 to 32 `vertices` (v, 3) [m], and return their ids
         (n,).
 
@@ -367,48 +327,32 @@ class Scene:
         scale and density [kg/m^3] one for all or (n,); velocities (3,) or (n, 3), the linear one is that of the centre
         of mass. ValueError for vertices that are not the corners of a convex solid.
         """
-        form = polyhedra.solid(vertices)
-        return self._add_form(form, positions, density, scale, quaternions, material, velocity, angular_velocity)
+        form, lengths = polyhedra.solid(vertices), {"scale": scale}
+        return self._append(form, positions, lengths, density, material, quaternions, velocity, angular_velocity)
 
     @_building
     def add_grains(
-        self,
-        positions: ArrayLike,
-        shape: Convex,
-        density: ArrayLike,
-        *,
-        scale: ArrayLike = 1.0,
-        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0),
-        material: str = "default",
-        velocity: ArrayLike = (0.0, 0.0, 0.0),
+        self, positions: ArrayLike, shape: Convex, density: ArrayLike, *, scale: ArrayLike = 1.0,
+        quaternions: ArrayLike = (1.0, 0.0, 0.0, 0.0), material: str = "default", velocity: ArrayLike = (0.0, 0.0, 0.0),
         angular_velocity: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> Ints | range:
+    ) -> Ints | range:  # fmt: skip
         """Add solid grains of one convex `shape`, such as a `dem.shapes.Cylinder`, and return their ids (n,).
 
         positions (n, 3) [m] and quaternions (4,) or (n, 4) are those of the frame of the shape, which must have its
         origin there; a grain has the shape times its `scale`. scale and density [kg/m^3] one for all or (n,);
         velocities (3,) or (n, 3). ValueError for other shapes.
         """
-        form = convex.form(shape)
-        return self._add_form(form, positions, density, scale, quaternions, material, velocity, angular_velocity)
+        form, lengths = convex.form(shape), {"scale": scale}
+        return self._append(form, positions, lengths, density, material, quaternions, velocity, angular_velocity)
 
     @_building
     def add_body(
-        self,
-        name: str,
-        shapes: Sequence[Shape],
-        motion: Motion = Fixed(),  # noqa: B008 - immutable
-        *,
-        position: Sequence[float] = (0.0, 0.0, 0.0),
-        quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
-        material: str = "default",
-        density: float | None = None,
-        mass: float | None = None,
-        inertia: Sequence[float] | None = None,
-        velocity: Sequence[float] = (0.0, 0.0, 0.0),
-        angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
-        surface_velocity: SurfaceVelocity | None = None,
-    ) -> None:
+        self, name: str, shapes: Sequence[Shape], motion: Motion = Fixed(), *,  # noqa: B008 - immutable
+        position: Sequence[float] = (0.0, 0.0, 0.0), quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
+        material: str = "default", density: float | None = None, mass: float | None = None,
+        inertia: Sequence[float] | None = None, velocity: Sequence[float] = (0.0, 0.0, 0.0),
+        angular_velocity: Sequence[float] = (0.0, 0.0, 0.0), surface_velocity: SurfaceVelocity | None = None,
+    ) -> None:  # fmt: skip
         """Add a large body made of `shapes`, which are placed in its body frame.
 
         The pose and the velocities are those of time zero. A dynamic body needs either its `density` [kg/m^3], or its
@@ -458,15 +402,9 @@ class Scene:
 
     @_building
     def add_load(
-        self,
-        name: str,
-        on: On = None,
-        *,
-        force: ArrayLike | Law = (0.0, 0.0, 0.0),
-        torque: ArrayLike | Law = (0.0, 0.0, 0.0),
-        start: float = 0.0,
-        end: float = np.inf,
-    ) -> None:
+        self, name: str, on: On = None, *, force: ArrayLike | Law = (0.0, 0.0, 0.0),
+        torque: ArrayLike | Law = (0.0, 0.0, 0.0), start: float = 0.0, end: float = np.inf,
+    ) -> None:  # fmt: skip
         """Put a force [N] at the centre of mass and a torque [N m] on each of some bodies: a large body or the grains
         of a material by its name, grains by their ids, or all grains. Each is (3,), for ids also (ids, 3), or a
         function of the time [s] and the table of the bodies, see `dem.parts.loads.Load`. They act from `start` to
@@ -478,17 +416,10 @@ class Scene:
 
     @_building
     def add_spring(
-        self,
-        name: str,
-        one: End,
-        other: End = None,
-        *,
-        stiffness: float,
-        damping: float = 0.0,
-        length: float | None = None,
-        anchor: Sequence[float] = (0.0, 0.0, 0.0),
+        self, name: str, one: End, other: End = None, *, stiffness: float, damping: float = 0.0,
+        length: float | None = None, anchor: Sequence[float] = (0.0, 0.0, 0.0),
         other_anchor: Sequence[float] = (0.0, 0.0, 0.0),
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Join two bodies, or a body and the world (None), by a spring with a damper, see `dem.parts.springs`.
 
         A body is a large body by its name or a grain by its id. The anchors (3,) are in the frames of the bodies, that
@@ -502,20 +433,10 @@ class Scene:
 
     @_building
     def add_joint(
-        self,
-        name: str,
-        one: End,
-        other: End = None,
-        *,
-        kind: str = "hinge",
-        anchor: Sequence[float],
-        axis: ArrayLike = (0.0, 0.0, 1.0),
-        speed: float | None = None,
-        target: float | None = None,
-        strength: float = np.inf,
-        limits: Sequence[float] = (-np.inf, np.inf),
-        touching: bool = False,
-    ) -> None:
+        self, name: str, one: End, other: End = None, *, kind: str = "hinge", anchor: Sequence[float],
+        axis: ArrayLike = (0.0, 0.0, 1.0), speed: float | None = None, target: float | None = None,
+        strength: float = np.inf, limits: Sequence[float] = (-np.inf, np.inf), touching: bool = False,
+    ) -> None:  # fmt: skip
         """Join two bodies, or a body and the world (None), by a joint of a `kind` of `dem.parts.joints.KINDS`.
 
         A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,), or the axes
@@ -551,22 +472,12 @@ class Scene:
 
     @_building
     def add_source(
-        self,
-        name: str,
-        region: Block | Cylinder,
-        *,
-        radius: float | Sequence[float] | Sizes | None = None,
-        density: float,
-        mass_rate: float | None = None,
-        number_rate: float | None = None,
-        most: float = np.inf,
-        material: str = "default",
-        velocity: Sequence[float] = (0.0, 0.0, 0.0),
-        shape: Sphere | Box | Capsule | Clump | Convex | ArrayLike | None = None,
-        start: float = 0.0,
-        end: float = np.inf,
-        seed: int = 0,
-    ) -> None:
+        self, name: str, region: Block | Cylinder, *, radius: float | Sequence[float] | Sizes | None = None,
+        density: float, mass_rate: float | None = None, number_rate: float | None = None, most: float = np.inf,
+        material: str = "default", velocity: Sequence[float] = (0.0, 0.0, 0.0),
+        shape: Sphere | Box | Capsule | Clump | Convex | ArrayLike | None = None, start: float = 0.0,
+        end: float = np.inf, seed: int = 0,
+    ) -> None:  # fmt: skip
         """Let grains come in a region of `dem.measures`, where there is room, from `start` to `end` [s].
 
         They are spheres of a `radius` [m], which may be a distribution of `dem.parts.sizes`; or have a `shape`, that
@@ -726,27 +637,6 @@ class Scene:
             raise ValueError(f"material {name!r}: allowed is a name, such as 'steel'")
         return self._materials.setdefault(name, len(self._materials))
 
-    def _add_grains(
-        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike,
-        material: str | Sequence[str], quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
-    ) -> Ints | range:  # fmt: skip
-        """Add grains of one kind, of which `lengths` has the columns of `size` by name; their ids."""
-        solid = partial(_plain, kind, tuple(lengths))
-        return self._append(
-            kind, positions, lengths, density, material, quaternions, velocity, angular_velocity, solid
-        )
-
-    def _add_form(
-        self, form: Form, positions: ArrayLike, density: ArrayLike, scale: ArrayLike, quaternions: ArrayLike,
-        material: str, velocity: ArrayLike, angular_velocity: ArrayLike,
-    ) -> Ints | range:  # fmt: skip
-        """Add grains of one form, whose positions and quaternions are those of the frame in which it was given; their
-        ids."""
-        kind, solid = form.BASE + self._know(form), partial(_formed, form)
-        return self._append(
-            kind, positions, {"scale": scale}, density, material, quaternions, velocity, angular_velocity, solid
-        )
-
     def _know(self, form: Form) -> int:
         """The number of a form among those of the scene."""
         if form not in self.forms:
@@ -754,11 +644,15 @@ class Scene:
         return self.forms.index(form)
 
     def _append(
-        self, kind: int, positions: ArrayLike, lengths: dict[str, ArrayLike], density: ArrayLike,
+        self, what: int | Form, positions: ArrayLike, lengths: Mapping[str, ArrayLike], density: ArrayLike,
         material: str | Sequence[str], quaternions: ArrayLike, velocity: ArrayLike, angular_velocity: ArrayLike,
-        solid: Callable[[dict[str, Floats]], tuple[Floats, ...]],
     ) -> Ints | range:  # fmt: skip
-        """Add grains of one kind; their ids, a range where the positions are a `Rule`."""
+        """Add grains of one kind, of which `lengths` has the columns of `size` by name, or of one form, times a scale,
+        in whose first frame positions and quaternions are; their ids, a range where the positions are a `Rule`."""
+        kind, solid = (
+            (what.BASE + self._know(what), partial(_formed, what)) if isinstance(what, Form)
+            else (what, partial(_plain, what, tuple(lengths)))
+        )  # fmt: skip
         if not isinstance(positions, Rule):
             positions = np.atleast_2d(checks.finite("positions", positions))
         count, first = len(positions), self.count

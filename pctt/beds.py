@@ -70,13 +70,9 @@ class Unreadable(ValueError):  # noqa: N818 - the reader adds the name of the fi
 
 
 def read_spheres(
-    path: str | Path,
-    density: ArrayLike | None = None,
-    radius: ArrayLike | None = None,
-    type: int | str | None = None,
-    frame: int = -1,
-    length: float | None = None,
-) -> dict[str, Any]:
+    path: str | Path, density: ArrayLike | None = None, radius: ArrayLike | None = None, type: int | str | None = None,
+    frame: int = -1, length: float | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Read the spheres of a file; what `Scene.add_spheres` takes: positions (n, 3) [m], radius [m] and density
     [kg/m^3], and if the file has them velocities (n, 3) [m/s, rad/s] and material, the types as "type 1", "type 2".
 

@@ -104,17 +104,10 @@ class Simulation:
     """
 
     def __init__(
-        self,
-        scene: Scene | Experiment,
-        settings: Settings | None = None,
-        *,
-        comm: MPI.Comm = MPI.COMM_WORLD,
-        restart: str | Path | state.RunState = "",
-        compare: ccp.Comparison | None = None,
-        say: Callable[[str], object] = print,
-        program: bool = False,
-        **changes: Any,
-    ):
+        self, scene: Scene | Experiment, settings: Settings | None = None, *, comm: MPI.Comm = MPI.COMM_WORLD,
+        restart: str | Path | state.RunState = "", compare: ccp.Comparison | None = None,
+        say: Callable[[str], object] = print, program: bool = False, **changes: Any,
+    ):  # fmt: skip
         """The scene at time zero, or as the checkpoint ``restart`` has it; "settled": in its settled state, which is
         made at first use.
 
@@ -297,15 +290,10 @@ class Simulation:
     @_collective
     @known_arguments()
     def run(
-        self,
-        *bare: float,
-        until: float | None = None,
-        steps: int | None = None,
-        stop: Callable[[Simulation], bool] | None = None,
-        every: int = 1,
-        call: Callable[[Simulation], object] | None = None,
-        progress: bool = False,
-    ) -> None:
+        self, *bare: float, until: float | None = None, steps: int | None = None,
+        stop: Callable[[Simulation], bool] | None = None, every: int = 1,
+        call: Callable[[Simulation], object] | None = None, progress: bool = False,
+    ) -> None:  # fmt: skip
         """Make steps until the time ``until`` [s], or so many ``steps``, or until ``stop(self)`` is true after one,
         whichever is first; after every ``every``-th of them, ``call(self)``. Then complete the folder of `write`. The
         first rank's values count. ``progress``: say where it is, and how long it goes on."""
@@ -529,16 +517,9 @@ class Simulation:
     @_collective
     @uninterrupted()
     def write(
-        self,
-        folder: str | Path,
-        *,
-        overwrite: bool = False,
-        every: int = 1,
-        checkpoint_every: int = 1,
-        checkpoint_minutes: float | None = None,
-        hard: int = 5,
-        problems: str | Path = "",
-    ) -> None:
+        self, folder: str | Path, *, overwrite: bool = False, every: int = 1, checkpoint_every: int = 1,
+        checkpoint_minutes: float | None = None, hard: int = 5, problems: str | Path = "",
+    ) -> None:  # fmt: skip
         """From now on write the files of a run (docs/files.md) to a folder, as ``-output`` does: a frame every so many
         steps (0: none), a checkpoint every so many, or in place of that after so many minutes, and the first ``hard``
         cone problems that the solver leaves; to the folder ``problems`` those of all steps.

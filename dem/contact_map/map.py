@@ -40,14 +40,9 @@ class ContactMap:
     has_parts = True  #: whether it has `only`
 
     def __init__(
-        self,
-        comm: MPI.Comm,
-        given: CompactRows,
-        halo: Halo | None = None,
-        body: np.ndarray | None = None,
-        precision: type[np.floating] = np.float64,
-        mass: InverseMass | None = None,
-    ):
+        self, comm: MPI.Comm, given: CompactRows, halo: Halo | None = None, body: np.ndarray | None = None,
+        precision: type[np.floating] = np.float64, mass: InverseMass | None = None,
+    ):  # fmt: skip
         if halo is None or body is None:
             given = checked(comm, given)
             halo, body = find_halo(comm, given.columns, given.body)

@@ -35,31 +35,10 @@ from pctt.log import phase
 from pctt.options import function_or_none, instance, known_arguments, short
 
 __all__ = [
-    "COULOMB",
-    "FORMS",
-    "LAWS",
-    "NEWTON",
-    "RELAXATION",
-    "SOLVERS",
-    "Accuracy",
-    "BlockRows",
-    "CompactRows",
-    "Comparison",
-    "ConeProblem",
-    "FrictionCones",
-    "Limits",
-    "Newton",
-    "Operator",
-    "Result",
-    "RollingCones",
-    "Status",
-    "measure",
-    "newton_for",
-    "solve",
-    "solved",
-    "watched",
-    "with_part",
-]
+    "COULOMB", "FORMS", "LAWS", "NEWTON", "RELAXATION", "SOLVERS", "Accuracy", "BlockRows", "CompactRows", "Comparison",
+    "ConeProblem", "FrictionCones", "Limits", "Newton", "Operator", "Result", "RollingCones", "Status", "measure",
+    "newton_for", "solve", "solved", "watched", "with_part",
+]  # fmt: skip
 
 GRIPS = 10.0  #: more friction than anything has, and so with any tolerance
 STEEP = 0.1  #: mu tol; with 0.05 a sphere rolls as it should, with 0.5 it may roll backwards
@@ -67,15 +46,10 @@ STEEP = 0.1  #: mu tol; with 0.05 a sphere rolls as it should, with 0.5 it may r
 
 @known_arguments(limits=Limits)
 def solve(
-    problem: ConeProblem,
-    guess: Array | None = None,
-    type: str = "auto",
-    limits: Limits | Mapping[str, Any] | None = None,
-    options: Any = None,
-    newton: Newton | None = None,
-    law: str = COULOMB,
-    monitor: Callable[[int, float], None] | None = None,
-) -> Result:
+    problem: ConeProblem, guess: Array | None = None, type: str = "auto",
+    limits: Limits | Mapping[str, Any] | None = None, options: Any = None, newton: Newton | None = None,
+    law: str = COULOMB, monitor: Callable[[int, float], None] | None = None,
+) -> Result:  # fmt: skip
     """Find impulses of Coulomb's law by a method of SOLVERS; with the ``law`` RELAXATION solve the cone problem.
 
     Where the method does not solve it, one other goes on from its impulses, with its own limit of iterations: `apgd`,

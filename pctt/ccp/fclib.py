@@ -321,12 +321,9 @@ def _symmetric(A: sp.spmatrix, name: str) -> tuple[sp.csr_matrix, str]:
 
 
 def write_local(
-    path: str | Path,
-    problem: ConeProblem,
-    info: Info | None = None,
-    solution: Solution | None = None,
+    path: str | Path, problem: ConeProblem, info: Info | None = None, solution: Solution | None = None,
     guess: Solution | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Write N, r, mu of a problem as W, q, mu of a local problem; collective.
 
     W is that of rigid contacts; the compliance is kept outside the groups of FCLIB. Raises OSError on all ranks if
@@ -349,19 +346,10 @@ def write_local(
 
 
 def write_global(
-    path: str | Path,
-    comm: MPI.Comm,
-    M: sp.spmatrix,
-    Ht: sp.spmatrix,
-    f: Array,
-    w: Array,
-    mu: Array,
-    info: Info | None = None,
-    solution: Solution | None = None,
-    guess: Solution | None = None,
-    point: Array | None = None,
-    compliance: Array | None = None,
-) -> None:
+    path: str | Path, comm: MPI.Comm, M: sp.spmatrix, Ht: sp.spmatrix, f: Array, w: Array, mu: Array,
+    info: Info | None = None, solution: Solution | None = None, guess: Solution | None = None,
+    point: Array | None = None, compliance: Array | None = None,
+) -> None:  # fmt: skip
     """Write M v = H r + f, u = H'v + w with all rows distributed over the ranks; collective.
 
     M (n, N) this rank's rows of the masses and inertia tensors, Ht (3 nc, N) its rows of H', f (n,) momenta without
@@ -375,16 +363,9 @@ def write_global(
 
 
 def _write(
-    path: str | Path,
-    comm: MPI.Comm,
-    form: str,
-    matrices: dict[str, sp.csr_matrix],
-    vectors: dict[str, Array],
-    info: Info | None,
-    solution: Solution | None,
-    guess: Solution | None,
-    extra: dict[str, Any],
-) -> None:
+    path: str | Path, comm: MPI.Comm, form: str, matrices: dict[str, sp.csr_matrix], vectors: dict[str, Array],
+    info: Info | None, solution: Solution | None, guess: Solution | None, extra: dict[str, Any],
+) -> None:  # fmt: skip
     """Gather the vectors, then write ``/fclib_local`` or ``/fclib_global`` under a temporary name until it is whole."""
     given = (("info", info, Info), ("solution", solution, Solution), ("guess", guess, Solution))
     wrong = [f"{name} {short(each)}: allowed is a {kind.__name__} of pctt.ccp.fclib" for name, each, kind in given

@@ -84,19 +84,10 @@ class ConeProblem:
 
     @known_arguments()
     def __init__(
-        self,
-        comm: MPI.Comm,
-        r: Array,
-        mu: Array | None = None,
-        *,
-        cones: Cones | None = None,
-        G: door.Given | None = None,
-        N: door.Matrix | GivenOperator | None = None,
-        masses: Any = None,
-        point: Array | None = None,
-        key: np.ndarray | None = None,
-        compliance: Array | float = 0.0,
-    ):
+        self, comm: MPI.Comm, r: Array, mu: Array | None = None, *, cones: Cones | None = None,
+        G: door.Given | None = None, N: door.Matrix | GivenOperator | None = None, masses: Any = None,
+        point: Array | None = None, key: np.ndarray | None = None, compliance: Array | float = 0.0,
+    ):  # fmt: skip
         if not isinstance(comm, MPI.Comm):
             raise ValueError(f"comm {short(comm)}: allowed is a communicator of mpi4py, such as MPI.COMM_WORLD")
         data = {"N": N, "G": G, "masses": masses, "point": point, "key": key, "compliance": compliance}

@@ -75,13 +75,9 @@ class Stepper:
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        world: World,
-        memory: ImpulseMemory,
-        newton: ccp.Newton | None = None,
+        self, settings: Settings, world: World, memory: ImpulseMemory, newton: ccp.Newton | None = None,
         dump: Dump | None = None,
-    ):
+    ):  # fmt: skip
         self.world, self.memory, self.newton, self.dump = world, memory, newton, dump
         self.use(settings)
         self._slabs: Ints | None = None  # those of the last step, whose impulses the memory has

@@ -22,29 +22,7 @@ from pctt.tt.sparse import Compression, SparseHierarchy, compress, relative_erro
 from pctt.tt.train import Train, decompose, decompose_matrix, identity, matrix_train, random, zeros
 
 __all__ = [
-    "Apply",
-    "Compression",
-    "Cross",
-    "EntryMatrix",
-    "GridDigits",
-    "Inverse",
-    "SparseHierarchy",
-    "Train",
-    "choose_modes",
-    "compress",
-    "compress_cross",
-    "decompose",
-    "decompose_matrix",
-    "identity",
-    "invert",
-    "invert_near_identity",
-    "lowest",
-    "matrix_train",
-    "merge",
-    "random",
-    "relative_error",
-    "residual",
-    "scalar_modes",
-    "slots_of",
-    "zeros",
-]
+    "Apply", "Compression", "Cross", "EntryMatrix", "GridDigits", "Inverse", "SparseHierarchy", "Train", "choose_modes",
+    "compress", "compress_cross", "decompose", "decompose_matrix", "identity", "invert", "invert_near_identity",
+    "lowest", "matrix_train", "merge", "random", "relative_error", "residual", "scalar_modes", "slots_of", "zeros",
+]  # fmt: skip
