@@ -78,13 +78,27 @@ def offsets(comm: MPI.Comm, count: int) -> Ints:
     return np.cumsum(ends)
 
 
-def on_any(comm: MPI.Comm, *here: bool) -> list[bool]:
+def on_any(comm: MPI.Comm, *here: bool | np.bool_) -> list[bool]:
     """Of each of some facts, whether it holds on any rank; collective, without a message per rank."""
     if comm.size == 1:
         return list(map(bool, here))
     held = np.array(here, dtype=np.int64)
     comm.Allreduce(MPI.IN_PLACE, held, MPI.MAX)
     return held.astype(bool).tolist()
+
+
+def on_all(comm: MPI.Comm, here: bool | np.bool_) -> bool:
+    """Whether a fact holds on all ranks; collective."""
+    return not on_any(comm, not here)[0]
+
+
+def summed(comm: MPI.Comm, here: Floats) -> Floats:
+    """The sum of an array over the ranks; collective."""
+    if comm.size == 1:
+        return here
+    out = np.empty(here.shape, here.dtype)
+    comm.Allreduce(np.ascontiguousarray(here), out)
+    return out
 
 
 def reduced(

@@ -145,7 +145,11 @@ class Surface:
     def near(self, points: Floats, reach: Floats) -> tuple[Ints, Ints]:
         """Pairs (rows of points, triangles), by rows; at least all triangles within reach (n,) [m] of points (n, 3)."""
         level = np.frexp(reach)[1]
-        found = [self._at_level(points, int(k), (level == k).nonzero()[0]) for k in np.unique(level)]
+        found = []
+        for k in np.unique(level):
+            cells = self._table(int(k))
+            row, entry = _entries(points, (level == k).nonzero()[0], cells.low, cells.width, cells.code, cells.start)
+            found.append((row, cells.triangle[entry]))
         row, triangle = found[0] if found else (np.zeros(0, np.int64),) * 2
         if len(found) > 1:
             row, triangle = map(np.concatenate, zip(*found))
@@ -153,12 +157,6 @@ class Surface:
             row, triangle = row[order], triangle[order]
         close = self._within(points, row, triangle, reach * (1.0 + 1e-9))
         return row[close], triangle[close]
-
-    def _at_level(self, points: Floats, level: int, rows: Ints) -> tuple[Ints, Ints]:
-        """Pairs (rows of points, triangles) of the cubes in which these rows of points are."""
-        cells = self._table(level)
-        row, entry = _entries(points, rows, cells.low, cells.width, cells.code, cells.start)
-        return row, cells.triangle[entry]
 
     def _within(self, points: Floats, row: Ints, triangle: Ints, reach: Floats) -> Ints:
         """Which of triangles (m,) may be within reach (n,) [m] of points (n, 3), these rows (m,) of them, by the

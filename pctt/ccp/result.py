@@ -17,10 +17,8 @@ from pctt.arrays import Array
 from pctt.options import COUNT, FRACTION, PART, number, option
 
 if TYPE_CHECKING:
-    from pctt.ccp.problem import Errors
-
-if TYPE_CHECKING:
     from pctt.ccp.accuracy import Accuracy
+    from pctt.ccp.problem import Errors
 
 #: The laws of contact, and how a law is named that a sequence of cone problems has found.
 RELAXATION, COULOMB, FIXED_POINT = "relaxation", "coulomb", "coulomb by cone problems"

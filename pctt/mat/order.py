@@ -22,6 +22,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.exchange import on_all
 from dem.geometry.morton import morton_codes
 from pctt.mat.entries import given
 from pctt.tt.quantise import GridDigits
@@ -81,7 +82,7 @@ def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), coordinates: Array | N
     check_points(points, P, "coordinates of the Mat")
     if points is not None:
         points = np.asarray(points, dtype=float)
-    elif _on_all(coordinates is not None, comm):
+    elif on_all(comm, coordinates is not None):
         points, whence = coordinates, "PCSetCoordinates"
         check_points(points, P, "PCSetCoordinates: points")
     else:
@@ -93,10 +94,6 @@ def places_of(P: PETSc.Mat, dms: Sequence[PETSc.DM] = (), coordinates: Array | N
         if rows is not None:
             shape, row_at = around, None if np.array_equal(rows, np.arange(len(rows))) else rows
     return Places(shape, row_at, points, source if shape is not None else whence, around)
-
-
-def _on_all(here: bool, comm: MPI.Comm) -> bool:
-    return bool(comm.allreduce(here, op=MPI.LAND))
 
 
 def check_points(points: object, P: PETSc.Mat, name: str) -> None:
@@ -152,7 +149,7 @@ def _fits(dm: PETSc.DM, P: PETSc.Mat, comm: MPI.Comm) -> bool:
     vec = dm.createGlobalVec()
     same = vec.getLocalSize() == P.getLocalSize()[0] and vec.getSize() == P.getSize()[0]
     vec.destroy()
-    return _on_all(same, comm)
+    return on_all(comm, same)
 
 
 def whole_numbers(grid: Any) -> tuple[int, ...] | None:
@@ -172,7 +169,7 @@ def _other_points(dms: Sequence[PETSc.DM], P: PETSc.Mat, comm: MPI.Comm) -> tupl
         if not coordinates.handle:
             continue
         width = dm.getCoordinateDim()
-        if _on_all(coordinates.getLocalSize() == width * count, comm):
+        if on_all(comm, coordinates.getLocalSize() == width * count):
             return coordinates.array_r.reshape(count, width).copy(), "the coordinates of a DM"
     points = _points_of_modes(P, comm)
     return points, "nothing" if points is None else "a near null space"

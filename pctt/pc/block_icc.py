@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from dem.exchange import on_all
 from pctt.blocks import shell_of
 from pctt.mat.order import places_of
 from pctt.options import option, word_or_number
@@ -91,7 +91,7 @@ class BlockICC(Preconditioner):
         with PETSc.Log.Event("BICSetUp"):
             pattern, values = _pattern_and_values(P)
             same = len(pattern) == len(self._pattern) and all(map(np.array_equal, pattern, self._pattern))
-            if not comm.allreduce(same, op=MPI.LAND):
+            if not on_all(comm, same):
                 self._begin(pc, P, pattern)
             failure = self._factorise(values)
         found = comm.allgather((failure, self.factor and self.factor.fill, self.factor and self.factor.shift))

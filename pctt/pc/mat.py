@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.exchange import on_all
 from pctt.blocks import block_csr_matrix, refuse_unready, symmetric_shell
 from pctt.mat.entries import diagonal, given, has_entries
 from pctt.mat.order import Places
@@ -183,7 +184,7 @@ def null_vectors(A: PETSc.Mat, P: PETSc.Mat) -> list[Array]:
 def has_negative_diagonal(P: PETSc.Mat) -> bool:
     """Whether all diagonal entries are negative, as in a negative definite matrix. P has entries, or is stored."""
     entries = diagonal(P) if has_entries(P) else P.getDiagonal().array_r
-    return bool(P.comm.tompi4py().allreduce(bool((entries < 0).all()), op=MPI.LAND))
+    return on_all(P.comm.tompi4py(), (entries < 0).all())
 
 
 def negated(A: PETSc.Mat) -> PETSc.Mat:
@@ -212,8 +213,7 @@ def replaced_blocks(P: PETSc.Mat) -> Array | None:
     """The diagonal blocks of a stored Mat, where some diagonal entry is zero or no finite number: `without_singular`.
     None otherwise."""
     diagonal = P.getDiagonal().array_r
-    wrong = bool(((diagonal == 0) | ~np.isfinite(diagonal)).any())
-    if not P.comm.tompi4py().allreduce(wrong, op=MPI.LOR):
+    if on_all(P.comm.tompi4py(), ((diagonal != 0) & np.isfinite(diagonal)).all()):
         return None
     size, here = P.getBlockSize(), P.getLocalSize()[0]
     indptr, indices, values = P.getDiagonalBlock().getValuesCSR()

@@ -18,7 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy import linalg
 
-from dem.exchange import on_first
+from dem.exchange import on_all, on_first, summed
 from pctt.mat.entries import Entries, diagonal, diagonal_blocks
 from pctt.pc.mat import conjugate_gradients
 from pctt.tt.conjugate import DIGITS, ConjugateGradients, CostEstimate, iterations
@@ -98,7 +98,7 @@ class PartialCholesky:
         """The values (n, m) of these rows of all ranks."""
         out = np.zeros((len(rows), values.shape[1]))
         out[mine] = values[rows[mine] - self.first]
-        return _sum(self.comm, out)
+        return summed(self.comm, out)
 
     def diagonals(self) -> list[Array]:
         """Two diagonals (n,) in place of R: its mean everywhere, and its own; at pivots what the other pivots leave."""
@@ -152,7 +152,7 @@ class Nystrom:
     def __init__(self, comm: MPI.Comm, F: Array, D: Array) -> None:
         self.comm, self.rank = comm, F.shape[1]
         self._inverse, self._scaled = 1.0 / D, F / D[:, None]
-        gram = _sum(comm, F.T @ self._scaled)
+        gram = summed(comm, F.T @ self._scaled)
         gram[np.diag_indices_from(gram)] += 1.0
         self._root = on_first(comm, lambda: linalg.cholesky(gram, lower=True))
 
@@ -170,16 +170,8 @@ class Nystrom:
 
     def __call__(self, x: Array) -> Array:
         """This rank's part of the product, from its part of x, (n,) or (k, n)."""
-        inner = linalg.cho_solve((self._root, True), _sum(self.comm, self._scaled.T @ x.T))
+        inner = linalg.cho_solve((self._root, True), summed(self.comm, self._scaled.T @ x.T))
         return x * self._inverse - (self._scaled @ inner).T
-
-
-def _sum(comm: MPI.Comm, x: Array) -> Array:
-    if comm.size == 1:
-        return x
-    out = np.empty(x.shape)
-    comm.Allreduce(np.ascontiguousarray(x), out)
-    return out
 
 
 class Trial(NamedTuple):
@@ -274,13 +266,13 @@ def block_jacobi(P: PETSc.Mat) -> Callable[[Array], Array] | None:
     """
     blocks, comm = diagonal_blocks(P), P.comm.tompi4py()
     first = next((one for one in comm.allgather(blocks[:1]) if len(one)), np.zeros((1, 1, 1)))
-    if comm.allreduce(bool((np.abs(blocks - first) <= 1e-12 * np.abs(first)).all()), op=MPI.LAND):
+    if on_all(comm, (np.abs(blocks - first) <= 1e-12 * np.abs(first)).all()):
         return None
     try:
         inverses = np.linalg.inv(blocks)
     except np.linalg.LinAlgError:
         inverses = np.full_like(blocks, np.nan)
-    if not comm.allreduce(bool(np.isfinite(inverses).all()), op=MPI.LAND):
+    if not on_all(comm, np.isfinite(inverses).all()):
         return None
     return lambda x: (inverses @ x.reshape(len(blocks), -1, 1)).ravel()
 

@@ -13,13 +13,12 @@ the identity stays exact, and a train of rank zero is block Jacobi.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dem.exchange import on_all
 from dem.geometry.morton import Frame, morton_codes
 from pctt.blocks import inverse_diagonal_blocks
 from pctt.mat.grid_train import TrainProduct
@@ -95,17 +94,16 @@ class Slots:
         """(n,) slot of each block row of the present matrix, among those of all ranks."""
         return self.first + self.place
 
-    def follow(self, P: PETSc.Mat, places: Places, agree: Callable[[bool], bool]) -> bool:
-        """Take the rows of another matrix.
+    def follow(self, P: PETSc.Mat, places: Places) -> bool:
+        """Take the rows of another matrix; collective.
 
-        If they do not fit or few rows would keep their slots, return False and change nothing. ``agree`` tells whether
-        all ranks say yes.
+        If they do not fit or few rows would keep their slots, return False and change nothing.
         """
         keys, points = P.getAttr("key"), places.points
         place = None
         if self.evolving and keys is not None and points is not None:
             place = self._follow(np.asarray(keys), np.asarray(points, dtype=float))
-        if not agree(place is not None):
+        if not on_all(P.comm.tompi4py(), place is not None):
             return False
         assert place is not None
         self.place = place
@@ -183,7 +181,7 @@ class SlottedMatrix:
     def lists(self, csr: CSR) -> bool:
         """Whether `list_blocks` has seen this pattern; collective. A Mat may get another one with as many nonzeros."""
         same = self._csr is not None and all(map(np.array_equal, self._csr, csr[:2]))
-        return self.comm.allreduce(same, op=MPI.LAND)
+        return on_all(self.comm, same)
 
     def list_blocks(self, csr: CSR) -> None:
         """Find the blocks of P: ``rows`` and ``columns``."""
@@ -215,7 +213,7 @@ class SlottedMatrix:
                 self.root = np.linalg.cholesky(inverse_diagonal_blocks(P)).transpose(0, 2, 1)
         except np.linalg.LinAlgError:
             good = False
-        return self.comm.allreduce(good, op=MPI.LAND)
+        return on_all(self.comm, good)
 
     def load(self, P: PETSc.Mat, csr: CSR) -> Array:
         """The present blocks (nb, bs, bs) of P at ``rows`` and ``columns``, with scaling multiplied by the roots of

@@ -11,12 +11,14 @@ one is tried after 2 set-ups, and then after twice as many each time, as long as
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import DTypeLike
 from petsc4py import PETSc
 
-from dem.exchange import on_first
+from dem.exchange import on_all, on_first, summed
 from pctt import memory
 from pctt.blocks import symmetric_shell
 from pctt.mat.grid_train import TrainProduct
@@ -97,7 +99,8 @@ class SparseTrain:
             self._waits -= 1
             return False
         self.failure = ""
-        if not np.isfinite(P.norm(PETSc.NormType.FROBENIUS)) and not self._all(_is_finite(P)):  # a norm may overflow
+        norm = P.norm(PETSc.NormType.FROBENIUS)  # which may overflow
+        if not np.isfinite(norm) and not on_all(self.comm, np.isfinite(P.getValuesCSR()[2]).all()):
             return self._refuse("the matrix has entries that are NaN or infinite")
         self.symmetric = is_symmetric(P)
         if self.options.reuse == "none":
@@ -124,7 +127,7 @@ class SparseTrain:
 
     def _slots_of(self, P: PETSc.Mat) -> SlottedMatrix:
         """The slots of P's block rows; those of the last structure if they fit."""
-        if self.tree is not None and not self.tree.follow(P, self.places, self._all):
+        if self.tree is not None and not self.tree.follow(P, self.places):
             self.account.resets += 1
             self._forget_trains()
         if self.tree is None:
@@ -141,7 +144,7 @@ class SparseTrain:
                 slots.list_blocks(csr)
                 modes = slots.modes or choose_modes(slots.size, LEAF)
                 self.hierarchy = SparseHierarchy(
-                    slots.rows, slots.columns, modes, slots.block, self._add, self.comm.bcast
+                    slots.rows, slots.columns, modes, slots.block, partial(summed, self.comm), self.comm.bcast
                 )
         self.hierarchy.set_values(slots.load(P, csr))
         warm = self.compression is not None
@@ -222,16 +225,6 @@ class SparseTrain:
         if self.options.reuse != "none":
             self._pause = self._waits = 2 * self._pause + 1
 
-    def _all(self, here: bool) -> bool:
-        return bool(self.comm.allreduce(here, op=MPI.LAND))
-
-    def _add(self, x: Array) -> Array:
-        if self.comm.size == 1:
-            return x
-        out = np.empty(x.shape, x.dtype)
-        self.comm.Allreduce(np.ascontiguousarray(x), out)
-        return out
-
     # -- application ----------------------------------------------------------------------------------------
 
     def _use(self, inverse: Inverse) -> None:
@@ -286,11 +279,6 @@ class SparseTrain:
             f"inverse {form} ranks {X.ranks} residual {self.inverse.residual:.2g}, "
             f"{X.storage} numbers"
         )
-
-
-def _is_finite(P: PETSc.Mat) -> bool:
-    """Whether the entries of this rank's rows are numbers."""
-    return bool(np.isfinite(P.getValuesCSR()[2]).all())
 
 
 def _projection(v: Array, modes: tuple[int, ...]) -> Train:

@@ -45,9 +45,9 @@ def slots_of(points: np.ndarray, keys: np.ndarray) -> Slots:
     return Slots(mat, places_of(mat), BOX)
 
 
-def follow(slots: Slots, points: np.ndarray, keys: np.ndarray, agrees: bool = True) -> bool:
+def follow(slots: Slots, points: np.ndarray, keys: np.ndarray) -> bool:
     mat = springs(points, keys)
-    return slots.follow(mat, places_of(mat), lambda here: here and agrees)
+    return slots.follow(mat, places_of(mat))
 
 
 def by_key(slots: Slots, keys: np.ndarray) -> dict[int, int]:
@@ -105,7 +105,7 @@ def test_rows_that_move_far_move_to_another_slot():
 
 
 @pytest.mark.parametrize("what", ["too many", "too many in one place", "strangers", "another rank refuses"])
-def test_what_does_not_fit_changes_nothing(what):
+def test_what_does_not_fit_changes_nothing(what, monkeypatch):
     points, keys = cloud(1000)
     slots = slots_of(points, keys)
     before = slots.place.copy()
@@ -116,7 +116,10 @@ def test_what_does_not_fit_changes_nothing(what):
     points, names = np.concatenate([points, crowd]), np.concatenate([keys, 20_000 + np.arange(more)])
     if what == "strangers":
         names = 20_000 + names
-    assert not follow(slots, points, names, what != "another rank refuses")
+    with monkeypatch.context() as patched:
+        if what == "another rank refuses":
+            patched.setattr("pctt.pc.slots.on_all", lambda comm, here: False)
+        assert not follow(slots, points, names)
     assert np.array_equal(slots.place, before)
     assert follow(slots, *cloud(1000))  # and it still knows the rows that it had
     assert np.array_equal(slots.place, before)
