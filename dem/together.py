@@ -117,17 +117,17 @@ def digest(words: str) -> int:
     return int(hashlib.sha256(words.encode()).hexdigest()[:15], 16)
 
 
-def first_differing_rank(comm: MPI.Comm, words: str, numbers: Sequence[Floats] = (), rounding: float = 1e-11) -> int:
+def first_differing_rank(comm: MPI.Comm, words: str, numbers: Sequence[Floats] = ()) -> int:
     """The first rank whose words or numbers are not those of rank 0; 0 if all are alike; collective.
 
-    Of each array its shape and a sum with fixed weights are compared. Sums may differ by ``rounding`` times the largest
-    number and the root of their count, as processors of other kinds have other last bits."""
+    Of each array its shape and a sum with fixed weights are compared. Sums may differ by 1e-11 times the largest number
+    and the root of their count, as processors of other kinds have other last bits."""
     sums, sizes = zip(*(_weighted(np.ravel(array)) for array in numbers)) if numbers else ((), ())
     here = np.array([digest(words + str([np.shape(array) for array in numbers])), *sums])
     first = comm.bcast(here)
     same = len(here) == len(first) and here[0] == first[0]
     if same:
-        same = bool(np.all(np.abs(here - first)[1:] <= rounding * np.array(sizes)))
+        same = bool(np.all(np.abs(here - first)[1:] <= 1e-11 * np.array(sizes)))
     found = comm.allreduce(comm.size if same else comm.rank, MPI.MIN)
     return found % comm.size
 

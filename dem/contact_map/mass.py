@@ -18,7 +18,7 @@ from mpi4py import MPI
 from dem.arrays import Floats, Ints
 from dem.contact_map import loops
 from dem.contact_map.rows import BlockRows, CompactRows
-from dem.exchange import offsets
+from dem.exchange import offsets, summed
 
 Mass = TypeVar("Mass", bound="InverseMass")
 
@@ -115,11 +115,8 @@ class ConstrainedMass(InverseMass):
 
     couples = True
 
-    def __init__(
-        self, comm: MPI.Comm, root: Floats, here: Ints, slot: Ints, coupling: Floats,
-        precision: type[np.floating] = np.float64,
-    ):  # fmt: skip
-        super().__init__(root, precision)
+    def __init__(self, comm: MPI.Comm, root: Floats, here: Ints, slot: Ints, coupling: Floats):
+        super().__init__(root)
         self.comm, self.here, self.slot, self.coupling = comm, here, slot, coupling
         self.shared = len(coupling) // 6
         self._given = root[here]
@@ -143,9 +140,7 @@ class ConstrainedMass(InverseMass):
         """The rows (shared, 6) of all constrained bodies from the own ones (k, 6); collective."""
         out = np.zeros((self.shared, 6))
         out[self.slot] = own
-        if self.comm.size > 1:
-            self.comm.Allreduce(MPI.IN_PLACE, out)
-        return out
+        return summed(self.comm, out)
 
     def held(self, v: Floats) -> Floats:
         """(I - K) v (columns, 6) of mass-scaled velocities; collective."""
@@ -211,28 +206,21 @@ class CellMass(InverseMass):
 
     couples, shared, axes = True, 1, 3
 
-    def __init__(self, comm: MPI.Comm, root: Floats, cell: CellStep, precision: type[np.floating] = np.float64):
-        super().__init__(root, precision)
+    def __init__(self, comm: MPI.Comm, root: Floats, cell: CellStep):
+        super().__init__(root)
         self.comm, self.cell = comm, cell
         self.more = int(comm.rank == comm.size - 1)
 
     def momenta(self, m: Floats, pushed: Floats) -> Floats:
         out = np.zeros((len(self.root) + self.more, 6), self.precision)
         loops.scale(self.root, m, out)
-        push = self.summed(pushed)
+        push = summed(self.comm, pushed)  # [N s m]
         if self.more:
             out[-1, :3] = self.cell.root * push
         return out
 
-    def summed(self, pushed: Floats) -> Floats:
-        """The sum (3,) of the pushes (3,) of all ranks [N s m]."""
-        out = pushed.copy()
-        if self.comm.size > 1:
-            self.comm.Allreduce(MPI.IN_PLACE, out)
-        return out
-
     def share(self, m: Floats, pushed: Floats, s: Floats) -> None:
-        s[0, :3] = self.summed(pushed)
+        s[0, :3] = summed(self.comm, pushed)
 
     def rates(self, s: Floats) -> Floats:
         return self._rounded(self.cell.root**2 * s[0, :3])

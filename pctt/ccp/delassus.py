@@ -351,12 +351,11 @@ def _product(indptr, indices, blocks, x):
     return y
 
 
-def ritz_values(
-    product: Callable[[Array], Array], start: Array, total: Callable[[Any], Any], steps: int = 30
-) -> Array:
-    """The Ritz values, ascending, of a symmetric operator after Lanczos steps from a vector with parts on all ranks;
+def ritz_values(product: Callable[[Array], Array], start: Array, total: Callable[[Any], Any]) -> Array:
+    """The Ritz values, ascending, of a symmetric operator after 30 Lanczos steps from a vector with parts on all ranks;
     ``total`` sums over them. The vectors are kept, and made orthogonal twice, so that the values are right to rounding.
     An eigenvalue of -1 % of the largest shows after about 20 steps."""
+    steps = 30
     size = np.sqrt(total(np.vdot(start, start)))
     if not size > 0.0:
         return np.zeros(1)

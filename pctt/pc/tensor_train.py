@@ -238,7 +238,9 @@ class TensorTrain(Preconditioner):
 
     def preSolve(self, pc: PETSc.PC, ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec) -> None:
         if self.P is not None and self.rank > 1:
-            self._last_precision = self._precision(self._is_unharmed(ksp))
+            outermost = ksp.getTabLevel() == 0
+            unharmed = ksp.getType() in UNHARMED or (outermost and ksp.getType() in REFINING)
+            self._last_precision = self._precision(unharmed)
             self.made.use(self._last_precision)
         self._turned = ksp.getType() in ABSOLUTE and self.P is not None and has_negative_diagonal(self.P)
         cost_estimate = None if self.P is None or self.failed else self.made.cost_estimate
@@ -246,12 +248,6 @@ class TensorTrain(Preconditioner):
         if cost_estimate is not None and Watch.can(ksp, pc):
             self._watch = Watch(ksp, b, x, cost_estimate, self._trials, self.sign)
             self._trials = 0.0
-
-    @staticmethod
-    def _is_unharmed(ksp: PETSc.KSP) -> bool:
-        """Whether a Krylov method is as accurate with products in single precision."""
-        outermost = ksp.getTabLevel() == 0
-        return ksp.getType() in UNHARMED or (outermost and ksp.getType() in REFINING)
 
     def _precision(self, unharmed: bool) -> type:
         """The precision of products, for a Krylov method that single precision harms or not."""

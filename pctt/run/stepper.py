@@ -74,11 +74,9 @@ class Stepper:
     Owns its ``newton`` and keeps the impulses of the last step; `destroy` frees them.
     """
 
-    def __init__(
-        self, settings: Settings, world: World, memory: ImpulseMemory, newton: ccp.Newton | None = None,
-        dump: Dump | None = None,
-    ):  # fmt: skip
-        self.world, self.memory, self.newton, self.dump = world, memory, newton, dump
+    def __init__(self, settings: Settings, world: World, memory: ImpulseMemory, newton: ccp.Newton | None = None):
+        self.world, self.memory, self.newton = world, memory, newton
+        self.dump: Dump | None = None
         self.use(settings)
         self._slabs: Ints | None = None  # those of the last step, whose impulses the memory has
         if settings.stiffness is not None:

@@ -290,8 +290,10 @@ def compress(
     """
     rng = np.random.default_rng(0) if rng is None else rng
     norm = matrix.norm()
-    if norm == 0 or len(matrix.modes) == 1:
-        return _exact(matrix)
+    if len(matrix.modes) == 1:
+        return Compression(matrix_train([matrix.leaf_core(np.ones((1, 1)))], matrix.modes), 0.0, 0)
+    if norm == 0:
+        return Compression(zeros(matrix.modes, matrix.modes), 0.0, 0)
     cores = [] if start is None else start.flat()
     sweeps = (0 if cores else 1) if sweeps is None else sweeps
     wide = Train(_widen(matrix, cores, max_rank, rng)).right_orthogonal().cores
@@ -348,13 +350,6 @@ def relative_error(matrix: SparseHierarchy, train: Train) -> float:
         return train.norm()
     square = 1 - 2 * matrix.inner(train.flat()) / norm**2 + (train.norm() / norm) ** 2
     return float(max(square, CERTAIN**2) ** 0.5)
-
-
-def _exact(matrix: SparseHierarchy) -> Compression:
-    """The exact train of a matrix that is zero or has a single mode."""
-    if len(matrix.modes) > 1:
-        return Compression(zeros(matrix.modes, matrix.modes), 0.0, 0)
-    return Compression(matrix_train([matrix.leaf_core(np.ones((1, 1)))], matrix.modes), 0.0, 0)
 
 
 def _widen(matrix: SparseHierarchy, cores: list[Array], rank: int, rng: np.random.Generator) -> list[Array]:
