@@ -434,14 +434,14 @@ class Scene:
     @_building
     def add_joint(
         self, name: str, one: End, other: End = None, *, kind: str = "hinge", anchor: Sequence[float],
-        axis: ArrayLike = (0.0, 0.0, 1.0), speed: float | None = None, target: float | None = None,
+        axis: ArrayLike | None = None, speed: float | None = None, target: float | None = None,
         strength: float = np.inf, limits: Sequence[float] = (-np.inf, np.inf), touching: bool = False,
     ) -> None:  # fmt: skip
         """Join two bodies, or a body and the world (None), by a joint of a `kind` of `dem.parts.joints.KINDS`.
 
-        A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,), or the axes
-        that the kind has, are in the world at time zero, where angle and position are zero; they are those of `other`
-        relative to `one`. A motor keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a `speed` at that
+        A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,), by default
+        z, or the axes that the kind has, are in the world at time zero, where angle and position are zero; they are
+        those of `other` relative to `one`. A motor keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a `speed` at that
         at most, with a torque or force of at most `strength` [N m, N]; inf: as much as it takes. `limits` (2,): least
         and greatest angle [rad] or position [m]. The two bodies go through each other, unless they are `touching`.
         """

@@ -102,14 +102,14 @@ class Kind(NamedTuple):
     coordinate: int = 5  #: the number of its free coordinate among these, that of motors and limits
     motor: bool = False  #: whether it may have them
     turns: int = VECTOR  #: what its turns are
-    axes: int = 1  #: that a user gives; of two the second one is the x axis
+    axes: int = 1  #: that it has; of two the second one is the x axis
 
 
 KINDS = {
     "hinge": Kind((True, True, True, True, True, False), motor=True, turns=ABOUT_Z),
     "slider": Kind((True, True, False, True, True, True), coordinate=2, motor=True),
-    "ball": Kind((True, True, True, False, False, False)),
-    "fixed": Kind((True,) * 6),
+    "ball": Kind((True, True, True, False, False, False), axes=0),
+    "fixed": Kind((True,) * 6, axes=0),
     "universal": Kind((True, True, True, False, True, False), turns=ABOUT_PINS, axes=2),
 }
 
@@ -179,7 +179,8 @@ class Joint(Constraint):
     ) -> Joint:
         """The joint with the anchor [m] and axis (3,), or axes (2, 3), of the world at time zero, where all its
         coordinates are zero."""
-        place, pins = checks.vector(f"anchor of {name!r}", anchor), axis if np.ndim(axis) > 1 else [axis]
+        place = checks.vector(f"anchor of {name!r}", anchor)
+        pins = [(0.0, 0.0, 1.0)] if axis is None else axis if np.ndim(axis) > 1 else [axis]
         z, *more = (np.array(checks.unit_vector(f"axis of {name!r}", pin)) for pin in pins)
         x = more[0] if more else quaternion.across(z[None])[0]
         if abs(x @ z) > 1e-9:
@@ -198,8 +199,9 @@ class Joint(Constraint):
         if not joint.low <= 0.0 <= joint.high:
             span = f"{joint.low:g} to {joint.high:g}"
             raise ValueError(f"limits of {name!r}, {span}: allowed are those about 0, where it is at time zero")
-        if (count := KINDS[joint.kind].axes) != 1 + len(more):
-            raise ValueError(f"axes of {name!r}: got {1 + len(more)}, allowed are {count} of a {joint.kind} joint")
+        count, asked = KINDS[joint.kind].axes, 0 if axis is None else len(pins)
+        if asked != count and (asked or count > 1):
+            raise ValueError(f"axes of {name!r}: got {asked}, allowed are {count} of a {joint.kind} joint")
         return joint
 
     @property

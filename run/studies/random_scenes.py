@@ -317,7 +317,9 @@ def add_joints(draw: Draw, made: Mixture, places: np.ndarray, density: float) ->
         if first is None:
             made.held = made.squeezed = True
         anchor, axis = 0.5 * (places[one] + places[other]), draw.rng.normal(size=3)
-        made.scene.add_joint(f"joint {k}", first, other, kind=kind, anchor=anchor, axis=axis, **given)
+        if kind in ("hinge", "slider"):
+            given["axis"] = axis
+        made.scene.add_joint(f"joint {k}", first, other, kind=kind, anchor=anchor, **given)
         made.features.append(f"{kind} {'to the world' if first is None else 'joint'}")
 
 

@@ -29,7 +29,8 @@ def pendulum(dt, length=1.0, kind="hinge"):
     """A small sphere that begins at the height of its hinge."""
     scene = Scene(friction=0.3)
     (ball,) = scene.add_spheres([length, 0, 0], 0.05, 1000.0)
-    scene.add_joint("pin", None, ball, kind=kind, anchor=(0, 0, 0), axis=(0, 1, 0))
+    axis = (0, 1, 0) if kind == "hinge" else None
+    scene.add_joint("pin", None, ball, kind=kind, anchor=(0, 0, 0), axis=axis)
     return simulation(scene, dt)
 
 
@@ -52,7 +53,7 @@ def test_bodies_that_fall_side_by_side_have_no_impulses(kind):
     boxes = scene.add_boxes([[0, 0.013, 5.1], [0.3, 0, 5.1], [0.6, 0.03, 5.1]], (0.15, 0.1, 0.1), 1000.0)
     scene.add_boxes([[0, 0.213, 5.1]], (0.15, 0.1, 0.1), 300.0)
     if kind is not None:
-        scene.add_joint("link", boxes[0], boxes[1], kind=kind, anchor=(0.15, 0, 5.1), axis=(0, 1, 0))
+        scene.add_joint("link", boxes[0], boxes[1], kind=kind, anchor=(0.15, 0, 5.1))
         for k, ball in enumerate(scene.add_spheres([[1, 0.2 * k, 0] for k in range(3)], 0.1, 1000.0)):
             scene.add_joint(f"pin {k}", None, ball, kind="ball", anchor=(0, 0.2 * k, 0))
     sim = simulation(scene, 0.005)
@@ -175,7 +176,7 @@ def test_a_fixed_joint_has_the_force_and_moment_of_its_cut():
 def wheel(**motor):
     scene = Scene(friction=0.3, gravity=(0, 0, 0))
     (ball,) = scene.add_spheres([0, 0, 0], 0.1, 1000.0)
-    scene.add_joint("axle", None, ball, anchor=(0, 0, 0), axis=(0, 0, 1), **motor)
+    scene.add_joint("axle", None, ball, anchor=(0, 0, 0), **motor)
     return scene
 
 
@@ -549,6 +550,8 @@ def test_a_body_that_is_squeezed_against_its_joint_has_no_solution():
         ({"speed": -1.0, "target": 1.0}, "speed of a motor with a target, -1: allowed is the greatest, above zero"),
         ({"kind": "ball", "speed": 1.0}, "no motor"),
         ({"limits": (1.0, 0.0)}, "limits"),
+        ({"kind": "fixed", "axis": (0, 1, 0)}, "axes of 'axle': got 1, allowed are 0 of a fixed joint"),
+        ({"kind": "universal"}, "axes of 'axle': got 0, allowed are 2 of a universal joint"),
         ({"strength": -1.0}, "strength"),
         ({"target": 4.0}, "target of a hinge, 4 rad: allowed are angles from -pi to pi"),
         ({"limits": (-1.0, 3.2)}, "high of a hinge, 3.2 rad"),
