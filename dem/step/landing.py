@@ -5,7 +5,7 @@ rocks from edge to edge, the second would bear its weight from the start of the 
 of speed of first order in the step. Velocities are those of the middle between two steps, so an impact at the time
 s dt comes (1/2 + s) dt after those before. Until then contacts go on to bear what they bore in the last step, 1/2 + s
 times that: what is more than once of it they bear in the next step, in which they are open. The step finds what they
-bear beside that.
+bear beside that. What stopped the body in the last step, beside what the forces on it press, they do not bear again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from dem.contact_map import ContactMap
     from dem.model.neighbourhood import Neighbourhood
 
-MOST = 2.0  #: normal impulses of a body over those of the forces on it, above which it was struck in the last step
 LEFT = 0.01  #: of what a contact bears before, which it bears beside that where it opens
 
 
@@ -59,10 +58,10 @@ def landing(
     table, gap = contacts.near.bodies, contacts.linear_gap
     push = length(free[:, :3] - table.velocity[:, :3])
     corners = _with_corners(world, contacts.near)
-    body, bears = _bearing(contacts.a, contacts.b, (table.mass, push), corners, gap, freely, last, dt)
-    if not on_any(contact_map.comm, bool(bears.any()))[0]:
+    body, share = _bearing(contacts.a, contacts.b, (table.mass, push), corners, gap, freely, last, dt)
+    if not on_any(contact_map.comm, bool(share.any()))[0]:
         return None
-    whole = np.where(bears[:, None], last, 0.0)
+    whole = share[:, None] * last
     speed = -dt * (freely[:, 0] + contact_map.velocities(contact_map.momenta(whole))[:, 0])
     lands = (body >= 0) & (last[:, 0] == 0.0) & (gap > 0.0) & (speed > gap)
     time = np.full(len(table.mass), np.inf)
@@ -83,12 +82,12 @@ def _with_corners(world: World, near: Neighbourhood) -> Bools:
 @loop
 def _bearing(
     a: Ints, b: Ints, laws: tuple[Floats, Floats], corners: Bools, gap: Floats, freely: Floats, last: Floats, dt: float
-) -> tuple[Ints, Bools]:
+) -> tuple[Ints, Floats]:
     """Of contacts (nc,) of a body with `corners` (rows,) and one that forces do not move, the row of the former, else
-    -1; and which of them bore in the last step, where another one of that body may close in this one. Bodies have
-    masses, and forces add to their speeds (rows,)."""
+    -1; and the share (nc,) of what they bore in the last step that the forces on the body press, where another one of
+    it may close in this one, else 0. Bodies have masses, and forces add to their speeds (rows,)."""
     mass, push = laws
-    body, bears = np.full(len(a), -1), np.zeros(len(a), np.bool_)
+    body, share = np.full(len(a), -1), np.zeros(len(a))
     lands, load = np.zeros(len(mass), np.bool_), np.zeros(len(mass))
     for c in range(len(a)):
         one, other = np.isfinite(mass[a[c]]), np.isfinite(mass[b[c]])
@@ -102,5 +101,6 @@ def _bearing(
         lands[n] |= last[c, 0] == 0.0 and gap[c] > 0.0 and gap[c] + dt * freely[c, 0] < 0.0
     for c in range(len(a)):
         n = body[c]
-        bears[c] = n >= 0 and lands[n] and last[c, 0] > 0.0 and load[n] <= MOST * mass[n] * push[n]
-    return body, bears
+        if n >= 0 and lands[n] and last[c, 0] > 0.0:
+            share[c] = min(1.0, mass[n] * push[n] / load[n])
+    return body, share
