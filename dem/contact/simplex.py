@@ -9,7 +9,7 @@ import numpy as np
 
 from dem.arrays import Floats, Ints
 from dem.compiled import inlined, inner
-from dem.geometry.vectors import dot
+from dem.geometry.vectors import cross, dot, plus
 
 #: Corners and edges that are closer to each other across the normal than this share of the lesser half thickness of the
 #: two count as one on top of the other.
@@ -48,8 +48,8 @@ def nearer(count, square, simplex):
         better = dot(point[0], point[0])
         parts[0], parts[1], parts[2] = 0.0, 0.0, 1.0
     elif count == 1:
-        a, b = dot(point[0], point[0]), dot(point[0], point[1])
-        t = min(max((a - b) / (a - 2.0 * b + dot(point[1], point[1])), 0.0), 1.0)
+        way = plus(point[1], -1.0, point[0])
+        t = min(max(-dot(way, point[0]) / dot(way, way), 0.0), 1.0)
         parts[0], parts[1], parts[2], better = 1.0 - t, 0.0, t, 0.0
         for n in range(3):
             better += ((1.0 - t) * point[0, n] + t * point[1, n]) ** 2
@@ -77,9 +77,10 @@ def nearer(count, square, simplex):
 def _on_triangle(a, b, c, share):
     """Fill in the shares of the corners of a triangle in its point nearest to the origin (Ericson 2005, "Real-time
     collision detection", 5.1.5); its squared distance."""
-    aa, bb, cc, ab, ac, bc = dot(a, a), dot(b, b), dot(c, c), dot(a, b), dot(a, c), dot(b, c)
-    d1, d2, d3, d4, d5, d6 = aa - ab, aa - ac, ab - bb, ab - bc, ac - bc, ac - cc
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    ab, ac = plus(b, -1.0, a), plus(c, -1.0, a)
+    d1, d2, d3, d4, d5, d6 = -dot(ab, a), -dot(ac, a), -dot(ab, b), -dot(ac, b), -dot(ab, c), -dot(ac, c)
+    n = cross(ab, ac)  # products of d1 to d6 would lose what is narrow
+    va, vb, vc = dot(n, cross(b, plus(c, -1.0, b))), -dot(n, cross(a, ac)), dot(n, cross(a, ab))
     if d1 <= 0.0 and d2 <= 0.0:
         v, w = 0.0, 0.0
     elif d3 >= 0.0 and d4 <= d3:

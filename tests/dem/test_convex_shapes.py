@@ -26,7 +26,7 @@ LYING = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # along x
 FORMS = tuple(map(form, (
     Cylinder(R, L), Superellipsoid((0.31, 0.24, 0.17)), Superellipsoid((0.2, 0.3, 0.25), (3.0, 5.0)),
     Superellipsoid((R, R, R)),
-))) + (polyhedra.solid(CORNERS * [0.4, 0.5, 0.1]),)  # fmt: skip
+))) + (polyhedra.solid(CORNERS * [0.4, 0.5, 0.1]), form(Cylinder(R, 0.02)))  # fmt: skip
 HULLS, SUPPORTS = hulls_of(FORMS), supports_of(FORMS)
 
 
@@ -182,7 +182,7 @@ def test_a_cylinder_stands_on_the_side_of_another_on_two_points_whichever_is_the
 
 
 def test_capsules_are_as_far_from_polyhedra_as_from_boxes():
-    rng, plate, cases = np.random.default_rng(6), POLYHEDRON + len(FORMS) - 1, 0
+    rng, plate, cases = np.random.default_rng(6), POLYHEDRON + 4, 0
     for _ in range(200):
         center, turn = rng.uniform(-0.8, 0.8, 3), quaternion.normalized(rng.normal(size=4))
         core = (center, quaternion.matrix(turn), np.array([0, 0, 0.3]), 0.15)
@@ -196,6 +196,21 @@ def test_capsules_are_as_far_from_polyhedra_as_from_boxes():
     lying = met(body(CAPSULE, (0.1, 0.05, 0.299), LYING, (0.2, 0.6, 0)), body(plate, (0, 0, 0)))
     np.testing.assert_allclose(lying.touch.gap, [-1e-3] * 2, atol=1e-12)
     np.testing.assert_allclose(np.sort(lying.touch.point[:, 0]), [-0.4, 0.4], atol=2e-4)
+
+
+@pytest.mark.parametrize("half", [0.3, 3.0, 30.0])
+def test_a_thin_disc_goes_over_the_edge_of_a_large_box(half):
+    """The normal turns with it. The distance of an edge of metres and a rim that is closer by four orders of magnitude is
+    that of triangles as narrow as that."""
+    on_edge, gap = quaternion.exponential(np.array([np.pi / 2, 0, 0])), 1e-4
+    floor, normal = body(BOX, (-half, 0, -half), size=(half, half, half)), []
+    angles = np.radians(np.linspace(2.0, 88.0, 300))
+    away = np.stack([np.sin(angles), 0.0 * angles, np.cos(angles)], axis=1)
+    for way in away:
+        found = met(body(CONVEX + 5, (R + gap) * way, on_edge), floor).touch
+        np.testing.assert_allclose(found.gap, gap, atol=5e-5)
+        normal.append(found.normal.mean(axis=0))
+    np.testing.assert_allclose(normal, -away, atol=2e-3)
 
 
 def test_what_is_no_shape_of_grains_is_refused():
