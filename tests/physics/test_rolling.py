@@ -9,8 +9,9 @@ from drive import RADIUS, SOLVERS, G, make_steps, on_incline, sphere, steps
 import pctt
 from dem import quaternion
 from dem.mesh import Mesh
+from dem.motion import Dynamic
 from dem.scene import Scene
-from dem.shapes import Box
+from dem.shapes import Box, Plane
 
 
 def slip(world):
@@ -86,3 +87,24 @@ def test_a_capsule_rolls_over_joints_as_over_a_plane(floor):
     sim.run(until=0.2)
     assert sim.kinetic_energy == pytest.approx(energy, rel=3e-4)
     np.testing.assert_allclose(sim.velocities[0, :3], way, atol=3e-4)
+
+
+@pytest.mark.parametrize(("sides", "within"), [(32, 0.02), (64, 0.07)])
+def test_a_wheel_with_many_sides_loses_what_a_polygon_loses(sides, within):
+    """At each side its spin falls by (I + m R^2 cos(2 pi / n)) / (I + m R^2), of which the spin before is a part. At the
+    default step it goes over 0.3 and 0.6 sides in a step."""
+    radius, half, speed, scene = 0.05, 0.1, 0.5, Scene(0.5)
+    lying = quaternion.exponential(np.array((-np.pi / 2, 0, 0)))
+    wheel = Mesh.revolved([(0, -half), (radius, -half), (radius, half), (0, half)], sides)
+    height = -quaternion.rotate(lying, wheel.vertices)[:, 2].min()
+    pose = {"position": (0, 0, height + 1e-9), "quaternion": lying}
+    scene.add_body("floor", [Plane((0, 0, 1))])
+    motion = {"velocity": (speed, 0, 0), "angular_velocity": (0, speed / radius, 0)}
+    scene.add_body("wheel", [wheel], Dynamic(), density=1000.0, **pose, **motion)
+    sim = pctt.Simulation(scene)
+    sim.run(until=0.05)
+    energy, angle = sim.kinetic_energy, []
+    sim.run(until=0.6, call=lambda sim: angle.append(sim.settings.dt * sim.body("wheel").velocity[4]))
+    side = 2 * np.pi / sides
+    kept = ((0.5 + np.cos(side)) / 1.5) ** (2 * sum(angle) / side)
+    assert sim.kinetic_energy / energy == pytest.approx(kept, abs=within)
