@@ -200,8 +200,8 @@ def test_capsules_are_as_far_from_polyhedra_as_from_boxes():
 
 @pytest.mark.parametrize("half", [0.3, 3.0, 30.0])
 def test_a_thin_disc_goes_over_the_edge_of_a_large_box(half):
-    """The normal turns with it. The distance of an edge of metres and a rim that is closer by four orders of magnitude is
-    that of triangles as narrow as that."""
+    """The normal turns with it. Triangles that give the distance of an edge of metres and of a rim close to it are
+    narrow."""
     on_edge, gap = quaternion.exponential(np.array([np.pi / 2, 0, 0])), 1e-4
     floor, normal = body(BOX, (-half, 0, -half), size=(half, half, half)), []
     angles = np.radians(np.linspace(2.0, 88.0, 300))
