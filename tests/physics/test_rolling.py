@@ -91,8 +91,8 @@ def test_a_capsule_rolls_over_joints_as_over_a_plane(floor):
 
 @pytest.mark.parametrize(("sides", "within"), [(32, 0.02), (64, 0.07)])
 def test_a_wheel_with_many_sides_loses_what_a_polygon_loses(sides, within):
-    """Each side leaves (I + m R^2 cos(2 pi / n)) / (I + m R^2) of its spin. By default it goes over 0.3 and 0.6 sides in
-    a step."""
+    """Each side leaves (I + m R^2 cos(2 pi / n)) / (I + m R^2) of its spin. It goes over 0.3 and 0.6 sides in
+    a step of the default."""
     radius, half, speed, scene = 0.05, 0.1, 0.5, Scene(0.5)
     lying = quaternion.exponential(np.array((-np.pi / 2, 0, 0)))
     wheel = Mesh.revolved([(0, -half), (radius, -half), (radius, half), (0, half)], sides)
