@@ -11,13 +11,15 @@ So it begins at the first guess, is stopped at a residual of 3e-4, and APGD goes
 Small problems are the exception: there it goes on to the end, and to an aim beyond the limits that APGD does not reach
 soon. Where friction is large, from 2 on, both may fail: APGD circles about the law, and the path of the conic method
 ends at a wall of its cones. So it begins once more without a guess; then plain projected steps, which do not circle,
-and the conic method with shorter steps take turns, and at last there are cone problems for given De Saxce terms
-(`pctt.ccp.coulomb`). Where the relaxation has no solution, nothing says that Coulomb's law has one.
+and the conic method with shorter steps take turns. At last there are cone problems for given De Saxce terms
+(`pctt.ccp.coulomb`), from the relaxation and from the best impulses. Where the relaxation has no solution, nothing says
+that Coulomb's law has one; if none is found the problem counts as unbounded.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -86,6 +88,8 @@ def solve(
                 tried.in_turns(options, basin)
             elif grown or not (small and second.final):
                 tried.apgd(second.impulse if second.iterations and not grown else first.impulse, limits.max_it)
+            if small and second.status is not Status.GIVEN_UP and not tried.all[-1].converged:
+                tried.at_last(guess)
     return tried.result()
 
 
@@ -161,7 +165,8 @@ class Attempts:
 
     @property
     def best(self) -> Result:
-        return min(self.all, key=lambda result: result.residual)
+        """That of the least residual, which says nothing of impulses that grow."""
+        return min(self.all, key=lambda result: (result.status is Status.UNBOUNDED, result.residual))
 
     def in_turns(self, options: Auto, basin: float) -> None:
         """Plain steps and shorter ones of the conic method, until APGD can go on; where they do not come so far the
@@ -173,24 +178,47 @@ class Attempts:
             if self.best.residual <= basin:
                 self.apgd(self.best.impulse, self.limits.max_it)
                 return
-        problem = self.problem
-        by_conic = partial(conic.solve, options=conic.Conic(), newton=self.newton)
-        limits = self.rest.but(max_it=self.most)
-        relaxed = by_conic(problem, np.zeros_like(problem.r), limits.unwatched)
-        if why := why_unbounded(problem, relaxed.impulse):
+        relaxed = self._by_conic(self.problem, np.zeros_like(self.problem.r), self._of_terms.unwatched)
+        if why := why_unbounded(self.problem, relaxed.impulse):
             self.keep(replace(relaxed, status=Status.UNBOUNDED, reason=f"of the relaxation, {why}"), "conic")
-            return
-        last = relaxed = replace(relaxed, status=Status.STALLED, residual=np.inf, reason="relaxation")
-        if problem.cones.parts == 1:  # without moments, whose terms it does not have
-            last = fixed_point(by_conic, problem, relaxed.impulse, limits, **TERMS)
-            last.after(relaxed)
-        self.keep(last, "conic").exhausted = True
+        else:
+            self.by_terms(relaxed.impulse)
+            self.all[-1].after(relaxed)
+
+    def at_last(self, guess: Array) -> None:
+        """What is left for the best impulses, or the guess where impulses have grown: APGD, where it has not just been
+        tried, the cone problems of their De Saxce terms, and shorter steps of the conic method."""
+        if self.all[-1].solver != "apgd":
+            grown = self.all[-1].status is Status.UNBOUNDED
+            self.apgd(guess if grown else self.best.impulse, self.limits.max_it)
+        if not self.all[-1].converged:
+            self.by_terms(self.best.impulse)
+        if not self.all[-1].converged:
+            self.conic(self.best.impulse, SHORT)
+        self.all[-1].exhausted = True
+
+    def by_terms(self, impulse: Array) -> None:
+        """Cone problems for given De Saxce terms, the first of them those of impulses; none with moments, whose terms
+        these problems do not have."""
+        if self.problem.cones.parts == 1:
+            self.keep(fixed_point(self._by_conic, self.problem, impulse, self._of_terms, **TERMS), "conic")
+
+    @property
+    def _by_conic(self) -> Callable[..., Result]:
+        return partial(conic.solve, options=conic.Conic(), newton=self.newton)
+
+    @property
+    def _of_terms(self) -> Limits:
+        return self.rest.but(max_it=self.most)
 
     def result(self) -> Result:
         """The last one, or the best where the first met the limits, or nothing is left to try; with what all have
         cost."""
-        last = self.all[-1]
-        found = self.best if self.all[0].converged or (last.exhausted and not last.final) else last
+        last = found = self.all[-1]
+        if self.all[0].converged:
+            found = self.best
+        elif last.exhausted and not last.converged:
+            found = next((result for result in self.all if result.status is Status.UNBOUNDED), self.best)
         found.exhausted = last.exhausted
         if len(self.all) > 1:
             found.reason = "; ".join(f"{result.solver}: {result.reason}" for result in self.all)
