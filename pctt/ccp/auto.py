@@ -205,7 +205,8 @@ class Attempts:
 
     @property
     def _by_conic(self) -> Callable[..., Result]:
-        return partial(conic.solve, options=conic.Conic(), newton=self.newton)
+        method = gathered if self.gathers else conic
+        return partial(method.solve, options=conic.Conic(), newton=self.newton)
 
     @property
     def _of_terms(self) -> Limits:
