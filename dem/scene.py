@@ -441,9 +441,10 @@ class Scene:
 
         A body is a large body by its name or a grain by its id. The `anchor` (3,) [m] and the `axis` (3,), by default
         z, or the axes that the kind has, are in the world at time zero, where angle and position are zero; they are
-        those of `other` relative to `one`. A motor keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a `speed` at that
-        at most, with a torque or force of at most `strength` [N m, N]; inf: as much as it takes. `limits` (2,): least
-        and greatest angle [rad] or position [m]. The two bodies go through each other, unless they are `touching`.
+        those of `other` relative to `one`. A motor keeps a `speed` [rad/s, m/s], or goes to a `target` [rad, m], with a
+        `speed` at that at most, with a torque or force of at most `strength` [N m, N]; inf: as much as it takes.
+        `limits` (2,): least and greatest angle [rad] or position [m]. The two bodies go through each other, unless they
+        are `touching`.
         """
         checks.new_name("joints", name, self.named["joint"])
         ends = checks.numbers(f"limits of {name!r}", limits)

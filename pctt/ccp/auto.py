@@ -19,7 +19,6 @@ that Coulomb's law has one; if none is found the problem counts as unbounded.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -39,6 +38,7 @@ from pctt.options import number
 
 CONIC_ITERATIONS = 60  # of the conic method at most, as in the registry
 USUAL = apgd.APGD()
+USUAL_CONIC = conic.Conic()
 PLAIN = apgd.APGD(damping=1.0, near=1.0)  # without momentum
 SHORT = conic.Conic(start=1.0, boundary_with_law=0.5)
 TERMS = {"most": 60, "depth": 2}  # cone problems for given De Saxce terms, where all else has failed
@@ -75,15 +75,15 @@ def solve(
         tried.beyond(guess, few)
     elif not (first.converged or first.final or first.exhausted) and first.iterations < limits.max_it:
         if not coulomb:
-            settings = conic.Conic()
-            tried.conic(first.impulse, replace(settings, start=min(settings.start, options.start * first.residual)))
+            start = min(USUAL_CONIC.start, options.start * first.residual)
+            tried.conic(first.impulse, replace(USUAL_CONIC, start=start))
         else:
             basin = max(limits.tol, options.basin)
-            second = tried.conic(guess, conic.Conic(), 0.0 if small else basin)
+            second = tried.conic(guess, USUAL_CONIC, 0.0 if small else basin)
             grown = second.status is Status.UNBOUNDED  # its path has left those of the law, which may have a solution
             failed = small and not grown and second.status is not Status.GIVEN_UP and second.residual > basin
             if failed and problem.norm(guess) > 0.0:  # a guess at the wall of its cones
-                second = tried.conic(np.zeros_like(guess), conic.Conic())
+                second = tried.conic(np.zeros_like(guess), USUAL_CONIC)
             if failed and second.residual > basin:
                 tried.in_turns(options, basin)
             elif grown or not (small and second.final):
@@ -138,23 +138,27 @@ class Attempts:
         limits = self.rest.but(max_it=min(most, self.limits.max_it), spare=spare)
         return self.keep(apgd.solve(self.problem, guess, limits, options, coulomb=self.coulomb), "apgd")
 
-    def _conic(self, guess: Array, limits: Limits, options: conic.Conic) -> Result:
+    def _by_conic(
+        self, problem: ConeProblem, guess: Array, limits: Limits, options: conic.Conic = USUAL_CONIC,
+        coulomb: bool = False,
+    ) -> Result:  # fmt: skip
+        """What the conic method makes of a problem that differs from the own one in r alone."""
         if self.whole is not None:
-            return self.keep(self.whole.solve(guess, limits, options, self.coulomb), "conic")
-        return self.keep(conic.solve(self.problem, guess, limits, options, self.newton, coulomb=self.coulomb), "conic")
+            return self.whole.solve(problem.r, guess, limits, options, coulomb)
+        return conic.solve(problem, guess, limits, options, self.newton, coulomb=coulomb)
 
     def conic(self, guess: Array, options: conic.Conic, basin: float = 0.0) -> Result:
         """To the limits, or to the ``basin`` of the residual alone."""
         limits = self.rest.but(max_it=self.most)
         if basin:
             limits = limits.but(tol=basin, closing_work=np.inf, closing_speed=np.inf)
-        return self._conic(guess, limits, options)
+        return self.keep(self._by_conic(self.problem, guess, limits, options, self.coulomb), "conic")
 
     def beyond(self, guess: Array, few: bool) -> None:
         """To the aim of limits that APGD has met: few contacts by the conic method, where APGD has not found it in its
         first attempt, many by APGD."""
         if few:
-            self._conic(guess, self.rest.but(max_it=self.most), conic.Conic())
+            self.conic(guess, USUAL_CONIC)
         if self.best.residual > self.limits.aimed and self.limits.spare and not few:
             self.apgd(self.best.impulse, self.limits.max_it, spare=self.limits.spare)
 
@@ -202,11 +206,6 @@ class Attempts:
         these problems do not have."""
         if self.problem.cones.parts == 1:
             self.keep(fixed_point(self._by_conic, self.problem, impulse, self._of_terms, **TERMS), "conic")
-
-    @property
-    def _by_conic(self) -> Callable[..., Result]:
-        method = gathered if self.gathers else conic
-        return partial(method.solve, options=conic.Conic(), newton=self.newton)
 
     @property
     def _of_terms(self) -> Limits:

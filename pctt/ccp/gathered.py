@@ -55,12 +55,14 @@ class Whole:
             self.problem = ConeProblem(MPI.COMM_SELF, r, mu, N=matrix, compliance=soft)
             self.is_cheap = by_elimination.order_of(matrix) is not None
 
-    def solve(self, guess: Array, limits: Limits, options: conic.Conic, coulomb: bool = False) -> Result:
-        """What `conic` makes of it on the first rank. Collective."""
-        starts, found = self.comm.gather(guess), None
-        if self.problem is not None and starts is not None:
+    def solve(self, r: Array, guess: Array, limits: Limits, options: conic.Conic, coulomb: bool = False) -> Result:
+        """What `conic` makes of it on the first rank, with velocities r (nc, 3) of each rank in place of its own.
+        Collective."""
+        parts, found = self.comm.gather((r, guess)), None
+        if self.problem is not None and parts is not None:
             own = Newton(MPI.COMM_SELF, "body")
-            found = conic.solve(self.problem, np.concatenate(starts), limits.unwatched, options, own, coulomb=coulomb)
+            r, start = map(np.concatenate, zip(*parts))
+            found = conic.solve(self.problem.with_r(r), start, limits.unwatched, options, own, coulomb=coulomb)
             own.destroy()
         result: Result = self.comm.bcast(found)
         for iteration, residual in enumerate(result.history):

@@ -76,7 +76,8 @@ def test_few_contacts_of_several_ranks_are_gathered_once(monkeypatch):
     known, graph = heap()
     problem = from_graph(known, graph, comm)
     found = gathered.whole(problem)
-    results = [found.solve(np.zeros_like(problem.r), Limits(1e-6, 60), conic.Conic()) for _ in range(2)]
+    given = problem.r, np.zeros_like(problem.r), Limits(1e-6, 60), conic.Conic()
+    results = [found.solve(*given) for _ in range(2)]
     assert len(made) == 1
     assert [ccp.measure(problem, result.impulse).natural_residual < 1e-5 for result in results] == [True, True]
     assert gathered.whole(problem.with_r(1e200 * problem.r)) is None  # no squares of such velocities are numbers
