@@ -111,7 +111,7 @@ class World:
     @property
     def ids(self) -> int:
         """Number of grains that there have been; their ids are less."""
-        return self.initial + sum(self.passages.tallies[name].count for name in self.passages.sources)
+        return self.initial + self.passages.inserted_count
 
     def __repr__(self) -> str:
         return f"<World: {self.body_count} bodies, {len(self.grains)} grains of this rank, time {self.time:g} s>"

@@ -70,6 +70,11 @@ class Passages:
         return Passages(self.sources if sources is None else sources, dict(self.outlets), tallies)
 
     @property
+    def inserted_count(self) -> int:
+        """Number of grains that have come."""
+        return sum(self.tallies[name].count for name in self.sources)
+
+    @property
     def removed_count(self) -> int:
         """Number of grains that have left."""
         return sum(self.tallies[name].count for name in self.outlets)
