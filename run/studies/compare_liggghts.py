@@ -471,7 +471,7 @@ def write_page(sizes: list[list[Row]], about: Row) -> None:
 PAGE, HEAD = shared.ROOT / "docs" / "measurements.md", "## Beside LIGGGHTS\n"
 TEXT = """`run/study compare_liggghts` writes this section. [LIGGGHTS](https://www.cfdem.com) 3.8.0 (`apt-get install
 liggghts`) is a soft-sphere code; both codes stir the same settled beds, on one core of an {cpu}, commit
-{commit}. Trust the ratios: cores of this name differ by a factor of 2.5.
+{commit}.
 
 {table}
 
@@ -482,9 +482,8 @@ liggghts`) is a soft-sphere code; both codes stir the same settled beds, on one 
 - Positions of the starts differ by 1e-5 m. Seconds are without start-up (median), overlaps the largest in % of a
   radius, torques means after 0.1 s, and the floor bears this part of the weight.
 - Within the first 0.4 s of n = 16 the torque of one start is off by up to 10 %.
-- LIGGGHTS does better in three ways: there is no tolerance to choose; at n = 16 it costs no more per grain than at
-  n = 8, where our iterations grow; and its memory is a fifth of ours, most of which is Python, PETSc and
-  compiled loops.
+- LIGGGHTS does better in two ways: there is no tolerance to choose, and its memory is a fifth of ours, most of which is
+  Python, PETSc and compiled loops.
 
 ![How far the torque is off its limit, over CPU seconds per simulated second; letters are the lines](liggghts.png)
 

@@ -161,12 +161,13 @@ def write_page(small: list[Row], large: list[Row], about: Row) -> None:
     """The section of docs/mujoco.md."""
     heads = ["CPU ms of a step of 2 ms", *(each["scene"] for each in small)]
     lines = [[code, *(f"{each[key]:.2g}" for each in small)] for code, key in (("MuJoCo", "theirs"), ("pctt", "ours"))]
-    columns = {"CPU s/s": ("cpu", ".3g"), "overlap, %": ("overlap", ".1f"), "torque, kN m": ("torque", ".1f"),
-               "±": ("torque_error", ".1f"), "floor": ("floor", ".3f"), "MiB": ("memory", ".0f")}  # fmt: skip
-    rows = []
-    for each in large:
-        values = [f"{each[key]:{form}}" for key, form in columns.values()]
-        rows.append([f"{each['spheres']:,} spheres, {each['starts']} x {each['seconds']:g} s", each["code"], *values])
+    rows: list[list[str]] = []
+    for k, each in enumerate(large):
+        begins = f"{each['spheres']:,} spheres, {each['starts']} x {each['seconds']:g} s"
+        torque = f"{each['torque']:.1f} ± {each['torque_error']:.1f}"
+        figures = f"{each['cpu']:.3g}", f"{each['overlap']:.1f}", torque, f"{each['floor']:.3f}"
+        rows.append(["" if k and each["n"] == large[k - 1]["n"] else begins, each["code"], *figures])
+    columns = "CPU s/s", "overlap, %", "torque, kN m", "floor"
     tables = shared.markdown(heads, lines), shared.markdown(["mixer", "", *columns], rows)
     words = {"cpu": about["cpu"], "commit": shared.commit(), "mujoco": mujoco.__version__}
     shared.replace_section(PAGE, HEAD, TEXT.format(few=tables[0], mixer=tables[1], **words))
