@@ -100,7 +100,9 @@ def test_a_wheel_with_many_sides_loses_what_a_polygon_loses(sides, within):
     pose = {"position": (0, 0, height + 1e-9), "quaternion": lying}
     scene.add_body("floor", [Plane((0, 0, 1))])
     motion = {"velocity": (speed, 0, 0), "angular_velocity": (0, speed / radius, 0)}
-    scene.add_body("wheel", [wheel], Dynamic(), density=1000.0, **pose, **motion)
+    across = (3 * radius**2 + 4 * half**2) / 12
+    moments = [across, across, radius**2 / 2]  # of a kilogram
+    scene.add_body("wheel", [wheel], Dynamic(), mass=1.0, inertia=moments, **pose, **motion)
     sim = pctt.Simulation(scene)
     sim.run(until=0.05)
     energy, angle = sim.kinetic_energy, []
