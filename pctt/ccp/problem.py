@@ -369,7 +369,8 @@ class ConeProblem:
         return everywhere if here.ndim else everywhere.item()
 
     def dot(self, x: Array, y: Array) -> float:
-        return self.sum(float(x.ravel().dot(y.ravel())))
+        with np.errstate(over="ignore"):  # infinite, of bodies that fly apart; numpy 2 warns
+            return self.sum(float(x.ravel().dot(y.ravel())))
 
     def norm(self, x: Array) -> float:
         return math.sqrt(self.dot(x, x))
