@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -102,7 +102,11 @@ class Attempts:
         self.usual = problem.norm(problem.r) / problem.mean_diagonal  # the size of impulses that the data suggest
         self.most = min(CONIC_ITERATIONS, limits.max_it)
         self.gathers = gathered.takes(problem, newton)
-        self.whole: gathered.Whole | None = None
+
+    @cached_property
+    def whole(self) -> gathered.Whole | None:
+        """The problem of all ranks, gathered once, where the conic method takes that. Collective."""
+        return gathered.whole(self.problem) if self.gathers else None
 
     def keep(self, result: Result, solver: str) -> Result:
         """Note a result. Impulses of self-stress may grow in Coulomb's law until their rounding throws bodies away, and
@@ -127,7 +131,6 @@ class Attempts:
         first = self.apgd(guess, count(self.limits.tol, few=few), spare=spare)
         ended = first.final or first.exhausted
         if few and first.residual > self.limits.aimed and not ended:
-            self.whole = gathered.whole(self.problem) if self.gathers else None
             few = self.whole is not None or (not self.gathers and self.newton.has_elimination(self.problem))
             if not (few or first.converged):
                 more = self.apgd(first.impulse, count(self.limits.tol))

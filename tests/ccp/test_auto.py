@@ -81,6 +81,12 @@ def test_few_contacts_of_several_ranks_are_gathered_once(monkeypatch):
     assert len(made) == 1
     assert [ccp.measure(problem, result.impulse).natural_residual < 1e-5 for result in results] == [True, True]
     assert gathered.whole(problem.with_r(1e200 * problem.r)) is None  # no squares of such velocities are numbers
+    newton = ccp.newton_for(comm, "auto")
+    tried = auto.Attempts(problem, Limits(1e-6, 60), newton, coulomb=False)
+    tried.beyond(np.zeros_like(problem.r), few=True)  # the limits that APGD has met
+    newton.destroy()
+    assert tried.best.converged
+    assert len(made) == 2
 
 
 def test_cone_problems_from_the_best_impulses_solve_what_all_else_left():
