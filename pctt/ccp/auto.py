@@ -50,17 +50,18 @@ class Auto:
     """Settings of `auto`."""
 
     patience: float = number(25.0, "APGD's iterations per digit of the tolerance and cube root of the contacts")
-    elimination: float = number(6.0, "APGD's iterations per digit of few contacts (`newton.elimination`): 1/2 `conic`")
+    elimination: float = number(4.0, "the same of few contacts (`newton.elimination`): `conic` takes 1 to 9 times that")
     law: float = number(5.0, "factor on it for Coulomb's law: more systems, and unsymmetric; docs/notebook_ccp.md")
+    law_of_few: float = number(2.5, "the same of few contacts: `conic` takes 1.4 to 1.9 times as long")
     start: float = number(3e4, "complementarity of the conic method's start, at most, by APGD's residual")
     basin: float = number(3e-4, "Coulomb residual at which the conic method's path is near enough for APGD")
     turns: int = number(4, "of plain steps and the conic method, where it fails in a small problem of Coulomb's law")
     plain: int = number(100, "plain steps in the first of them; twice as many in each other one")
 
     def iterations(self, problem: ConeProblem, tol: float, coulomb: bool, few: bool = False) -> int:
-        """Those of APGD. Small problems have fixed costs; where they are ``few`` those of both methods are calls."""
-        per_digit = self.elimination if few else self.patience * max(problem.size, 400) ** (1.0 / 3.0)
-        per_digit *= self.law if coulomb else 1.0
+        """Those of APGD. Small problems have fixed costs, unless their contacts are ``few``."""
+        per_digit, law, least = (self.elimination, self.law_of_few, 1) if few else (self.patience, self.law, 400)
+        per_digit *= (law if coulomb else 1.0) * max(problem.size, least) ** (1.0 / 3.0)
         return broadcast(problem.comm, int(-math.log10(tol) * per_digit))
 
 
@@ -128,7 +129,7 @@ class Attempts:
         count = partial(options.iterations, self.problem, coulomb=self.coulomb)
         few = self.newton.may_eliminate(self.problem) or self.gathers
         spare = options.iterations(self.problem, self.limits.aim, coulomb=False, few=True) if few else 0
-        first = self.apgd(guess, count(self.limits.tol, few=few), spare=spare)
+        first = self.apgd(guess, count(self.limits.aimed if few else self.limits.tol, few=few), spare=spare)
         ended = first.final or first.exhausted
         if few and first.residual > self.limits.aimed and not ended:
             few = self.whole is not None or (not self.gathers and self.newton.has_elimination(self.problem))

@@ -168,6 +168,8 @@ class Terminal(io.StringIO):
 
 def test_on_a_terminal_the_present_step_is_shown(settled, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"):  # those of mpiexec, which MPI itself may set
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "stdout", terminal := Terminal())
     simulated(database([*SMALL, "-restart", str(settled), "-steps", "2", "-ccp_type", "apgd"]))
     first, said = int(arrays(settled)["world/step"]) + 1, terminal.getvalue()
