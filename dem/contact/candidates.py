@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 from dem import bodies
 from dem.arrays import Bools, Floats, Ints
 from dem.bodies import BOX, MESH, PLANE
-from dem.compiled import loop
+from dem.compiled import inlined, loop
 from dem.contact.lists import Lists, Rows
 from dem.contact.primitives import Primitives
 from dem.contact.spheres import frame_of
 from dem.model.neighbourhood import Neighbourhood
 from dem.model.world import World
-from dem.quaternion import cross, length
 
 #: Rows i, j (m,) of `Primitives`, of which i has the lower number, and the gaps (m,) within which their margins meet.
 Pairs = tuple[Ints, Ints, Floats]
@@ -187,24 +186,52 @@ def fill(
 def _of_large(world: World, near: Neighbourhood, table: Primitives, delta: float, shifts: Floats) -> Pairs:
     """Pairs of the parts of two large bodies, of which one at least is free to move."""
     first = near.grains + near.ghosts
-    free = bodies.is_dynamic(world.large)
-    body = table.row[first:] - first
-    i, j = np.triu_indices(len(body), 1)
-    touch = (body[i] != body[j]) & (free[body[i]] | free[body[j]])
-    i, j = first + i[touch], first + j[touch]
-    # Two half spaces never touch: what has a centre tells how far the surfaces go
-    plane = table.kind[i] == PLANE
-    at = np.where(plane, j, i)
-    margins = [
-        _part_margin(shifts[:, row - first], near.bodies.position[row], table.center[at], table.radius[at], delta)
-        for row in (table.row[i], table.row[j])
-    ]
-    return i, j, margins[0] + margins[1]
+    shapes = tuple(column[first:] for column in (table.kind, table.center, table.size, table.radius))
+    of_bodies = bodies.is_dynamic(world.large), near.bodies.position[first:], shifts
+    return pairs_of_parts(first, table.row[first:] - first, shapes, of_bodies, delta)
 
 
-def _part_margin(shifts: Floats, pivot: Floats, center: Floats, radius: Floats, delta: float) -> Floats:
-    """Margins (m,) of the parts of large bodies at the surfaces of primitives of centres (m, 3) and radii (m,) [m]. The
-    bodies move and turn, about the pivots (m, 3), by any of the `shifts` (k, m, 6)."""
-    move, turn = shifts[..., :3], shifts[..., 3:]
-    travel = length(move + cross(turn, center - pivot)) + radius * length(turn)
-    return np.maximum(delta / 2, travel.max(axis=0))
+@loop
+def pairs_of_parts(first, body, shapes, of_bodies, delta):
+    """The loop of `_of_large`, over parts in the rows from the `first` on, of these bodies (parts,), which are free or
+    not (bodies,), and move and turn about their positions (bodies, 3) by any of the shifts (k, bodies, 6)."""
+    (kind, center, size, radius), (free, pivot, shifts) = shapes, of_bodies
+    count, room = 0, 16
+    one, two, reach = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
+    for i in range(len(body)):
+        for j in range(i + 1, len(body)):
+            if body[i] == body[j] or not (free[body[i]] or free[body[j]]):
+                continue
+            # Two half spaces never touch: what has a centre tells how far the surfaces go
+            at, on = (j, i) if kind[i] == PLANE else (i, j)
+            most = 0.0
+            for b in (body[i], body[j]):
+                most += part_margin(shifts, b, pivot[b], center[at], radius[at], delta)
+            x, y, z = center[at, 0] - center[on, 0], center[at, 1] - center[on, 1], center[at, 2] - center[on, 2]
+            if kind[on] == PLANE:
+                apart = x * size[on, 0] + y * size[on, 1] + z * size[on, 2] - radius[at]
+            else:
+                apart = np.sqrt(x * x + y * y + z * z) - (radius[i] + radius[j])
+            if apart > most + 1e-9 * radius[at]:  # where rounding matters, the narrow phase is to decide
+                continue
+            if count == room:
+                room *= 2
+                one, two = np.append(one, np.empty_like(one)), np.append(two, np.empty_like(two))
+                reach = np.append(reach, np.empty_like(reach))
+            one[count], two[count], reach[count] = first + i, first + j, most
+            count += 1
+    return one[:count], two[:count], reach[:count]
+
+
+@inlined
+def part_margin(shifts, body, pivot, center, radius, delta):
+    """The margin of a part of a large body at the surface of a shape of this centre and radius [m]. The body moves and
+    turns, about its pivot, by any of the `shifts` (k, bodies, 6)."""
+    most = 0.5 * delta
+    x, y, z = center[0] - pivot[0], center[1] - pivot[1], center[2] - pivot[2]
+    for s in range(len(shifts)):
+        p, q, r = shifts[s, body, 3], shifts[s, body, 4], shifts[s, body, 5]
+        a, b = shifts[s, body, 0] + q * z - r * y, shifts[s, body, 1] + r * x - p * z
+        c = shifts[s, body, 2] + p * y - q * x
+        most = max(most, np.sqrt(a * a + b * b + c * c) + radius * np.sqrt(p * p + q * q + r * r))
+    return most

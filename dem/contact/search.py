@@ -13,11 +13,11 @@ import numpy as np
 from dem import bodies
 from dem.arrays import Bools, Floats, Ints, Keys, places
 from dem.bodies import CAPSULE, CLUMP, FORM, MESH, POLYHEDRON, SPHERE
-from dem.compiled import loop
+from dem.compiled import inlined, loop
 from dem.contact.ahead import Course
 from dem.contact.candidates import Pairs, meeting
 from dem.contact.lists import Lists, grain_lists
-from dem.contact.primitives import Manifold, Primitives, extents, touches, touches_ahead
+from dem.contact.primitives import Manifold, Primitives, touches, touches_ahead
 from dem.model.images import Images, refuse_short
 from dem.model.neighbourhood import Neighbourhood, refreshed
 from dem.model.world import World
@@ -348,18 +348,40 @@ def _order(foreign, a, b, key):
     return order
 
 
-def exceeds_margin(world: World, shift: Floats, seen: Floats, delta: float) -> bool:
+def exceeds_margin(world: World, contacts: Contacts, shift: Floats, delta: float) -> bool:
     """Return whether a free large body that moves and turns by `shift` (large, 6) goes further than delta/2, and not as
-    in one of the shifts `seen` (k, large, 6) that its margin covers, to a hundredth of delta."""
+    in one of the shifts that its margin covers in the search for `contacts`, to a hundredth of delta."""
     if not world.large_moves:
         return False
-    free = bodies.is_dynamic(world.large)
-    size = extents([body.shapes for body in world.large_bodies])[free]
+    table, first = contacts.lists.table, len(contacts.lists.table.row) - len(contacts.lists.table.center)
+    parts = table.row[first:] - first, table.center, table.radius[first:]
+    return further(bodies.is_dynamic(world.large), parts, shift, contacts.shifts, delta)
 
-    def distance(shift: Floats) -> Floats:
-        return length(shift[..., free, :3]) + size * length(shift[..., free, 3:])
 
-    return bool(((distance(shift) > delta / 2) & (distance(shift - seen) > 0.01 * delta).all(axis=0)).any())
+@loop
+def further(free, parts, shift, seen, delta):
+    """The loop of `exceeds_margin`, over parts of bodies with these centres (parts, 3) and radii (parts,) in the frames
+    of the bodies. A half space counts with a metre."""
+    body, center, radius = parts
+    size = np.zeros(len(free))
+    for k in range(len(body)):
+        x, y, z = center[k, 0], center[k, 1], center[k, 2]
+        size[body[k]] = max(size[body[k]], np.sqrt(x * x + y * y + z * z) + radius[k])
+    for n in range(len(free)):
+        if free[n] and way(shift[n], size[n]) > 0.5 * delta:
+            covered = False
+            for s in range(len(seen)):
+                covered = covered or not way(shift[n] - seen[s, n], size[n]) > 0.01 * delta
+            if not covered:
+                return True
+    return False
+
+
+@inlined
+def way(shift, size):
+    """How far points go at most that are as far from the centre as the `size`."""
+    turn = np.sqrt(shift[3] ** 2 + shift[4] ** 2 + shift[5] ** 2)
+    return np.sqrt(shift[0] ** 2 + shift[1] ** 2 + shift[2] ** 2) + size * turn
 
 
 def greatest_travel(world: World, velocity: Floats, dt: float, further: float = 1.0) -> Floats:

@@ -46,7 +46,7 @@ def find_overrun(
     travel = greatest_travel(world, velocity[: len(seen)], dt)
     large = large_velocity(world, free, velocity)
     # the ranks tell each other also of large bodies, which all know: processors of other kinds may round otherwise
-    gone = bool((travel > seen).any()), exceeds_margin(world, dt * large, contacts.shifts, delta)
+    gone = bool((travel > seen).any()), exceeds_margin(world, contacts, dt * large, delta)
     further, beyond = on_any(world.comm, *gone)
     if not (further or beyond):
         return None

@@ -21,9 +21,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from dem import quaternion
 from dem.arrays import Bools, Floats, Ints
+from dem.compiled import inner, loop
 from dem.exchange import broadcast
 from dem.free_motion import free_spin, unequal
 from dem.model.world import World
@@ -38,6 +40,7 @@ Kinds = Sequence[tuple[type[Constraint], Sequence[Constraint]]]
 ROUNDS = 8  #: of the iteration for what is not linear in the velocities, at most
 FAR = 0.5  #: radians in a step above which it does not converge, and the step takes constraints as linear
 SWING = 0.1  #: (w dt)^2 / 2 of the frequency w [1/s] from which on swings are implicit
+DEPENDENT = 1e-8  #: what is left of the diagonal of a row, over it, where the row depends on those before
 SWINGS = -1  #: the kind of their rows, see `_swings`
 
 
@@ -102,12 +105,9 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
     count, every = len(ends.free), [part for _, members in parts for part in members]
     asked = [(n, *each) for n, part in enumerate(every) for each in part.conditions(found.error[n], dt)]
     which, coordinates, kind, t, bound, way = (np.array(column) for column in zip(*asked))
-    J, along = np.zeros((len(t), count, 6)), found.rows
-    for side in (0, 1):
-        J[np.arange(len(t)), row[which, side]] += along[which, coordinates, side]
-    root = ends.root
-    B = np.matmul(J[:, :, None], root).reshape(len(t), -1)
-    A, flat, expected, on = B @ B.T, J.reshape(len(t), -1), push.ravel(), kind <= MOTOR
+    root, (flat, B) = ends.root, rows_of_conditions(found.rows[which, coordinates], row[which], ends.root)
+    J, A, expected = flat.reshape(len(t), count, 6), gram(B), push.ravel()
+    on: Bools = kind <= MOTOR
     inverse = _inverse(A, on)
     g = _impulses(A, inverse, t, flat @ ends.free.ravel() + B @ expected, on, np.zeros(len(t)))
     force = np.zeros((len(every), 6))
@@ -166,7 +166,7 @@ def coupling(parts: Kinds, ends: Ends, dt: float, cell: Cell, push: Floats) -> C
         t = np.where(held, left - bent, left)
     t, free, on, saturated, inverse, spin, middle = best
     fixed = (J, B, root, which, coordinates, kind, t, bound, free, slip, found.axes)
-    solved = _solved(B, root, kind, t, bound, free, slip, on, saturated, inverse)
+    solved = _solved(A, B, root, kind, t, bound, free, slip, on, saturated, inverse)
     return Coupling(*fixed, on, saturated, *solved, spin=spin, middle=middle)
 
 
@@ -198,9 +198,9 @@ def refound(known: Coupling, push: Floats) -> Coupling | None:
     if not wrong.any():
         return None
     on, saturated = _turned(known.kind, known.bound, known.on, known.saturated, g, wrong)
-    numbers = known.kind, known.target, known.bound, known.free, known.slip
-    inverse = _inverse(_delassus(known.scaled, known.kind), on)
-    solver, impulse, change, matrix = _solved(known.scaled, known.root, *numbers, on, saturated, inverse)
+    numbers, A = (known.kind, known.target, known.bound, known.free, known.slip), _delassus(known.scaled, known.kind)
+    solved = _solved(A, known.scaled, known.root, *numbers, on, saturated, _inverse(A, on))
+    solver, impulse, change, matrix = solved
     return dataclasses.replace(
         known, on=on, saturated=saturated, solver=solver, impulse=impulse, change=change, matrix=matrix
     )
@@ -244,16 +244,88 @@ def _swings(ends: Ends, arms: Floats, force: Floats, B: Floats, inverse: Floats,
 def _delassus(B: Floats, kind: Ints) -> Floats:
     """B B' of rows with a compliance of 1 in those of swings, whose targets are the velocities before the step: so the
     mass is M + a' a."""
-    return B @ B.T + np.diag((kind == SWINGS).astype(float))
+    return gram(B) + np.diag((kind == SWINGS).astype(float))
+
+
+@loop
+def rows_of_conditions(along: Floats, body: Ints, root: Floats) -> tuple[np.ndarray, np.ndarray]:
+    """J and B (k, 6 n) of relative velocities `along` (k, 2, 6) of two bodies (k, 2), with roots (n, 6, 6) of M^-1."""
+    J, B = np.zeros((len(along), 6 * len(root))), np.zeros((len(along), 6 * len(root)))
+    for r in range(len(along)):
+        for side in range(2):
+            n = body[r, side]
+            for k in range(6):
+                J[r, 6 * n + k] += along[r, side, k]
+                for c in range(6):
+                    B[r, 6 * n + c] += along[r, side, k] * root[n, k, c]
+    return J, B
+
+
+@inner
+def bodies_of(B):
+    """Where the bodies of each row (k, 6 n) begin in their list, and these: most columns are zero."""
+    start, body, found = np.zeros(len(B) + 1, np.int64), np.empty(B.size // 6, np.int64), 0
+    for r in range(len(B)):
+        for n in range(B.shape[1] // 6):
+            if B[r, 6 * n : 6 * n + 6].any():
+                body[found] = n
+                found += 1
+        start[r + 1] = found
+    return start, body
+
+
+@loop
+def gram(B: Floats) -> Floats:
+    """B B' (k, k) of rows (k, 6 n)."""
+    (start, body), out = bodies_of(B), np.empty((len(B), len(B)))
+    for r in range(len(B)):
+        for s in range(r + 1):
+            p, q, total = start[r], start[s], 0.0
+            while p < start[r + 1] and q < start[s + 1]:
+                n = body[p]
+                if n == body[q]:
+                    for k in range(6 * n, 6 * n + 6):
+                        total += B[r, k] * B[s, k]
+                p, q = p + (n <= body[q]), q + (n >= body[q])
+            out[r, s] = out[s, r] = total
+    return out
+
+
+@loop
+def between(B: Floats, S: Floats) -> Floats:
+    """B' S B (6 n, 6 n) of rows (k, 6 n) and a matrix (k, k)."""
+    (start, body), right, out = bodies_of(B), np.zeros(B.shape), np.zeros((B.shape[1], B.shape[1]))
+    for r in range(len(B)):
+        for s in range(len(B)):
+            for p in range(start[s], start[s + 1]):
+                for k in range(6 * body[p], 6 * body[p] + 6):
+                    right[r, k] += S[r, s] * B[s, k]
+    for r in range(len(B)):
+        for p in range(start[r], start[r + 1]):
+            for k in range(6 * body[p], 6 * body[p] + 6):
+                for c in range(B.shape[1]):
+                    out[k, c] += B[r, k] * right[r, c]
+    return out
 
 
 def _inverse(A: Floats, on: Bools) -> Floats:
-    """The pseudo-inverse (k, k) of the symmetric A of the rows that hold, zero in the others."""
-    value, vector = np.linalg.eigh(A * (on[:, None] & on))
-    size = np.abs(value)
-    kept = size > 1e-12 * size.max(initial=0.0)
-    vector = vector[:, kept] * on[:, None]
-    return (vector / value[kept]) @ vector.T
+    """The pseudo-inverse (k, k) of the symmetric A of the rows that hold, zero in the others. Rows that depend on
+    others, as those of a closed chain, take its eigenvalues, which cost some times as much as a factor."""
+    rows = on.nonzero()[0]
+    held, out = A[rows[:, None], rows], np.zeros(A.shape)
+    if not len(rows):
+        return out
+    factor, failed = dpotrf(held, lower=True)
+    if not failed and (factor.diagonal() ** 2 > DEPENDENT * held.diagonal()).all():
+        lower = np.tril(dpotri(factor, lower=True)[0])
+        found = lower + np.tril(lower, -1).T
+    else:
+        value, vector = np.linalg.eigh(held)
+        size = np.abs(value)
+        kept = size > 1e-12 * size.max()
+        found = (vector[:, kept] / value[kept]) @ vector[:, kept].T
+    out[rows[:, None], rows] = found
+    return out
 
 
 def _impulses(A: Floats, inverse: Floats, t: Floats, free: Floats, on: Bools, saturated: Floats) -> Floats:
@@ -284,18 +356,18 @@ def _turned(kind: Ints, bound: Floats, on: Bools, saturated: Floats, g: Floats, 
 
 
 def _solved(
-    B: Floats, root: Floats, kind: Ints, t: Floats, bound: Floats, free: Floats, slip: Floats, on: Bools,
+    A: Floats, B: Floats, root: Floats, kind: Ints, t: Floats, bound: Floats, free: Floats, slip: Floats, on: Bools,
     saturated: Floats, inverse: Floats,
 ) -> tuple[Floats, Floats, Floats, Floats]:  # fmt: skip
-    """`solver`, `impulse`, `change` and `matrix` of a `Coupling`, with the `_inverse` of B B' of the rows that hold."""
-    A = _delassus(B, kind)
+    """`solver`, `impulse`, `change` and `matrix` of a `Coupling`, with A, see `_delassus`, and its `_inverse` for the
+    rows that hold."""
     g = _impulses(A, inverse, t, free, on, saturated)
     # Beyond what motors give without contacts; not positive where only these bring one to its speed: it is held there.
     room = bound - np.copysign(g, g * slip)
     yields = np.isfinite(bound) & (room > 0.0)
     e = np.divide(np.abs(slip), room, out=np.zeros(slip.shape), where=yields)
     solver = _inverse(A + np.diag(e), on) if yields.any() else inverse
-    K = B.T @ solver @ B
+    K = between(B, solver)
     if yields.any() or (kind == SWINGS).any():  # else it is a projector, and I - K its own root
         value, vector = np.linalg.eigh(K)
         K = (vector * (1.0 - np.sqrt(np.clip(1.0 - value, 0.0, 1.0)))) @ vector.T

@@ -12,6 +12,7 @@ from dem.measures import Block
 from dem.motion import Dynamic, Glide, Held
 from dem.scene import Scene
 from dem.shapes import Box, Plane
+from dem.unconstrained import constraints
 from pctt import ccp
 from pctt.ccp.delassus import BlockMap
 from pctt.folder import Folder
@@ -770,3 +771,32 @@ def test_axes_that_a_joint_cannot_have(kind, axis, words):
     scene.add_spheres([0, 0, 0], 0.1, 1000.0)
     with pytest.raises(ValueError, match=words):
         scene.add_joint("j", None, 0, kind=kind, anchor=(0, 0, 0), axis=axis)
+
+
+def test_products_of_the_rows_of_constraints_leave_out_zeros_alone():
+    rng = np.random.default_rng(0)
+    body, along = rng.integers(0, 7, (12, 2)), rng.normal(size=(12, 2, 6))
+    root = rng.normal(size=(7, 6, 6))
+    J, B = constraints.rows_of_conditions(along, body, root)
+    dense = np.zeros((12, 7, 6))
+    for side in (0, 1):
+        dense[np.arange(12), body[:, side]] += along[:, side]
+    np.testing.assert_allclose(J, dense.reshape(12, -1))
+    np.testing.assert_allclose(B, np.einsum("kni,nij->knj", dense, root).reshape(12, -1), atol=1e-12)
+    S = rng.normal(size=(12, 12))
+    np.testing.assert_allclose(constraints.gram(B), B @ B.T, atol=1e-11)
+    np.testing.assert_allclose(constraints.between(B, S), B.T @ S @ B, atol=1e-10)
+
+
+def test_rows_that_depend_on_others_have_the_pseudo_inverse():
+    """Those of a closed chain do; rows of very different sizes do not."""
+    rows = np.random.default_rng(1).normal(size=(9, 24))
+    size, here = np.geomspace(1.0, 1e6, 9), np.delete(np.arange(9), 4)
+    B = size[:, None] * rows
+    inverse = constraints._inverse(B @ B.T, np.arange(9) != 4)
+    assert not inverse[4].any()
+    scaled = (size[:, None] * inverse * size)[np.ix_(here, here)]
+    np.testing.assert_allclose(scaled @ rows[here] @ rows[here].T, np.eye(8), atol=1e-9)
+    closed = np.concatenate([rows, rows[:1] + rows[1:2]])
+    found = constraints._inverse(closed @ closed.T, np.ones(10, bool))
+    np.testing.assert_allclose(found, np.linalg.pinv(closed @ closed.T, rcond=1e-10, hermitian=True), atol=1e-9)
