@@ -96,7 +96,8 @@ def in_order(world: World, contacts: Contacts, motion: UnconstrainedMotion) -> C
 
     if not pairs.bounces:  # in a bed hardly any pair is near no other
         alone = _alone(contacts.a, contacts.b, ball)
-        if not on_any(world.comm, met(contacts.take(alone), closing[alone], slow[alone])[4])[0]:
+        some = len(alone) > 0 and met(contacts.take(alone), closing[alone], slow[alone])[4]
+        if not on_any(world.comm, some)[0]:
             return contacts
     kind, bounce, offset, marked, some = met(contacts, closing, slow)
     if not on_any(world.comm, some)[0]:

@@ -56,6 +56,8 @@ def landing(
     if world.only_spheres and not world.large_moves:
         return None
     table, gap = contacts.near.bodies, contacts.linear_gap
+    if not on_any(contact_map.comm, _any_closes(gap, freely, last, dt))[0]:
+        return None
     push = length(free[:, :3] - table.velocity[:, :3])
     corners = _with_corners(world, contacts.near)
     body, share = _bearing(contacts.a, contacts.b, (table.mass, push), corners, gap, freely, last, dt)
@@ -77,6 +79,15 @@ def _with_corners(world: World, near: Neighbourhood) -> Bools:
     round_parts = Sphere, Capsule, Convex
     corners[first:] = [not any(isinstance(part, round_parts) for part in large.shapes) for large in world.large_bodies]
     return corners
+
+
+@loop
+def _any_closes(gap: Floats, freely: Floats, last: Floats, dt: float) -> bool:
+    """Whether a contact (nc,) may close in the step that bore nothing in the last one."""
+    for c in range(len(gap)):
+        if last[c, 0] == 0.0 and gap[c] > 0.0 and gap[c] + dt * freely[c, 0] < 0.0:
+            return True
+    return False
 
 
 @loop
