@@ -200,8 +200,8 @@ def extents(shapes: list[tuple[Shape, ...]]) -> Floats:
 
 
 def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course | None = None) -> Manifold:
-    """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,); normals point from i to j. Those of
-    spheres with spheres, half spaces and boxes come first, in the order of the pairs. With a course those that follow
+    """All contacts of gap at most `delta` (m,) [m] of the pairs of rows i, j (m,), in their order, and in that of the
+    features; normals point from i to j. With a course those that are not of spheres with spheres, half spaces or boxes
     are of guests that are where `dem.contact.ahead.seen_from` puts them, with gaps that are wider by their ways.
 
     Two half spaces have none; other pairs that have none are refused by `refuse_untouchable`.
@@ -224,7 +224,9 @@ def touches(table: Primitives, i: Ints, j: Ints, delta: Floats, course: Course |
             pair, feature, touch = _touching(table, (one, two), guests, host, reach, here)
             found.append(Manifold(of_all(pair, number[here], sign[here], touch.normal), feature, touch))
     found = [part for part in found if len(part.pair)] or found[:1]
-    return joined(found) if len(found) > 1 else found[0]
+    whole = joined(found) if len(found) > 1 else found[0]
+    order = in_order(whole.pair, whole.feature, len(i))
+    return Manifold(whole.pair[order], whole.feature[order], whole.touch.take(order)) if len(order) else whole
 
 
 def touches_ahead(
@@ -382,6 +384,31 @@ def by_kinds(
         number[to], far[to], sign[to] = pairs[n], reach[pairs[n]], -1.0 if swap else 1.0
         start[code[n]] += 1
     return number, guest, host, far, sign, spans
+
+
+@loop
+def in_order(pair: Ints, feature: Ints, pairs: int) -> Ints:
+    """The contacts (nc,) of so many pairs by their pairs, and by their features; none if they are in this order. They
+    are counted into places by the pairs; of those of a pair, which are few, each goes before the greater ones."""
+    sorted_already, start = True, np.zeros(pairs + 1, np.int64)
+    for c in range(len(pair)):
+        start[pair[c] + 1] += 1
+        before = max(c - 1, 0)
+        sorted_already &= pair[before] < pair[c] or (pair[before] == pair[c] and feature[before] <= feature[c])
+    order = np.empty(0 if sorted_already else len(pair), np.int64)
+    if sorted_already:
+        return order
+    for n in range(pairs):
+        start[n + 1] += start[n]
+    end = start[:-1].copy()
+    for c in range(len(pair)):
+        first, to = start[pair[c]], end[pair[c]]
+        end[pair[c]] += 1
+        while to > first and feature[order[to - 1]] > feature[c]:
+            order[to] = order[to - 1]
+            to -= 1
+        order[to] = c
+    return order
 
 
 @loop

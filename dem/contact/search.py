@@ -181,7 +181,8 @@ def find_contacts(
     contacts = Contacts(key, a, b, *found.touch, friction, near, shifts, owned, lists, **ahead)
     if world.cell.periodic:
         contacts = _without_images(world, contacts, base, images)
-    _put_in_order(world, contacts, found.pair, table.members is not None or world.cell.periodic)
+    if table.members is not None or world.cell.periodic:
+        _put_in_order(world, contacts)
     if besides is not None:
         contacts = contacts.take(places(besides.key, contacts.key) < 0)
     return _without_rigid(world, contacts)
@@ -225,16 +226,11 @@ def _narrow(
     return found, {"moved": moved, "swing": swing, "linear": linear, "touched": touched if len(touched) else None}
 
 
-def _put_in_order(world: World, contacts: Contacts, pair: Ints, whole: bool) -> None:
-    """Order the rows of the contacts of these pairs (nc,), unless the `whole` needs it only those from the first one on
-    that has others behind it: shapes beside spheres come behind these, and touch in several points."""
-    descents = (pair[1:] <= pair[:-1]).nonzero()[0]
-    if whole or len(descents):
-        first = 0 if whole else int(np.searchsorted(pair[: descents[0] + 1], pair[descents[0] + 1 :].min()))
-        left = slice(first, None)
-        order = contact_order(world, contacts.near, contacts.a[left], contacts.b[left], contacts.key[left])
-        for column in contacts.columns().values():
-            column[left] = column[left].take(order, axis=0)
+def _put_in_order(world: World, contacts: Contacts) -> None:
+    """Order the rows of contacts of images and members of clumps, whose pairs are not in the order of contacts."""
+    order = contact_order(world, contacts.near, contacts.a, contacts.b, contacts.key)
+    for column in contacts.columns().values():
+        column[:] = column.take(order, axis=0)
 
 
 def _motions(world: World, near: Neighbourhood, images: Images, prescribed: Floats) -> Floats:

@@ -84,10 +84,10 @@ def _with_corners(world: World, near: Neighbourhood) -> Bools:
 @loop
 def _any_closes(gap: Floats, freely: Floats, last: Floats, dt: float) -> bool:
     """Whether a contact (nc,) may close in the step that bore nothing in the last one."""
+    found = False
     for c in range(len(gap)):
-        if last[c, 0] == 0.0 and gap[c] > 0.0 and gap[c] + dt * freely[c, 0] < 0.0:
-            return True
-    return False
+        found |= last[c, 0] == 0.0 and gap[c] > 0.0 and gap[c] + dt * freely[c, 0] < 0.0
+    return found
 
 
 @loop

@@ -100,9 +100,13 @@ class Attempts:
     def __init__(self, problem: ConeProblem, limits: Limits, newton: Newton, coulomb: bool):
         self.problem, self.limits, self.newton, self.coulomb = problem, limits, newton, coulomb
         self.all: list[Result] = []
-        self.usual = problem.norm(problem.r) / problem.mean_diagonal  # the size of impulses that the data suggest
         self.most = min(CONIC_ITERATIONS, limits.max_it)
         self.gathers = gathered.takes(problem, newton)
+
+    @cached_property
+    def usual(self) -> float:
+        """The size of impulses that the data suggest. Collective."""
+        return self.problem.norm(self.problem.r) / self.problem.mean_diagonal
 
     @cached_property
     def whole(self) -> gathered.Whole | None:
