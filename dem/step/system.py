@@ -85,6 +85,7 @@ class ContactSystem:
         landing: what contacts bear until bodies land, a `dem.step.landing.Landing`, or None
         later (nc, 3): what of it they bear in the next step, which `kept` finds and gives bodies at once [N s]
         drives: of the large bodies, the same on all ranks
+        strikes (nc,): which contacts are impacts
         at_once: how many contacts of this rank bounce with all others of the step, and not in their order
         coupling: by constraints, a `dem.unconstrained.constraints.Coupling`; None if there are none
         applied: what parts give, a `dem.unconstrained.applied.Applied`; None if none do
@@ -118,10 +119,10 @@ class ContactSystem:
         self.problem_map = self.contact_map if self.resistance is None else self.resistance.map
         self.landing = landing(world, contacts, self.contact_map, free, freely, last, self.dt)
         self._bear(freely, b)
-        impacts = self._impacts(world, freely, eased, b)
-        self.mu = np.where(impacts, 0.0, self.friction) if smooth else self.friction
+        self.strikes = self._impacts(world, freely, eased, b)
+        self.mu = np.where(self.strikes, 0.0, self.friction) if smooth else self.friction
         swing = np.zeros((0, 3)) if contacts.swing is None else contacts.swing
-        self.r = _beyond(b, freely, rounding, self.frame, swing, impacts, self.compliance, self.held)
+        self.r = _beyond(b, freely, rounding, self.frame, swing, self.strikes, self.compliance, self.held)
         if self.resistance is not None:
             self.resistance.velocity[np.abs(self.resistance.velocity) <= rounding[:, None]] = 0.0
 

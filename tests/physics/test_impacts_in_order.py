@@ -117,6 +117,18 @@ def test_impacts_that_are_not_followed_are_counted():
             assert (sim.step()["impacts_at_once"] > 0) == counted
 
 
+def test_a_gas_in_a_box_keeps_its_energy_where_nothing_is_lost():
+    """By the default tolerance: an impact of many in a step is no more too strong than the next is too weak."""
+    scene = Scene(friction=0.0, gravity=(0, 0, 0), restitution=1.0)
+    places = 10 * R * (np.indices((4, 4, 4)).reshape(3, -1).T - 1.5)
+    scene.add_spheres(places, 3 * R, DENSITY, velocity=np.random.default_rng(1).normal(size=(64, 3)))
+    scene.add_body("box", [Plane(s * n, -s * 20 * R * n) for n in np.eye(3) for s in (-1, 1)])
+    with pctt.Simulation(scene) as sim:
+        energy = sim.kinetic_energy
+        sim.run(steps=200)  # some 20 impacts of each ball
+        assert sim.kinetic_energy == pytest.approx(energy, rel=1e-3)
+
+
 def test_a_ball_keeps_its_height_where_nothing_is_lost():
     """e = 1 under gravity: heights of bounces by places of touch, in steps of a third of a radius at most."""
     scene = Scene(friction=0.3, restitution=1.0)
