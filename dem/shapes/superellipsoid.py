@@ -21,10 +21,12 @@ from dem.shapes.convex import Convex, revolved
 #: Exponents that are allowed: convex, with the ball of the shortest axis in it, and edges that a search can follow.
 EXPONENTS = between(2.0, 20.0)
 
-#: Cosine of the angle to an axis within which a flat side faces a direction; tangent of that of the normals, along flat
-#: sections, at the points of it that bear beside the closest one: a body on a flat side would rock on one alone.
-FACING = 0.9
-TILT = 0.1
+#: Cosine of the angle to an axis within which a flat side faces a direction; tangents of those of the normals, along
+#: flat sections, at the points of it that bear beside the closest one: a body on a flat side would rock on one alone.
+#: Where exponents are above FLAT no step follows how that goes to and fro: with the first tangent bodies gain up to ten
+#: times their energy, and never rest. With the second one lesser exponents take the energy of bodies that rock.
+FACING, FLAT = 0.9, 4.0
+TILT, LESS = 0.1, 1e-4
 
 GRID = 24  #: intervals of a quarter of the directions in which the curvature is looked up
 SAFE = 0.9  #: what counts of the least radius found, as there may be lesser ones between
@@ -61,8 +63,9 @@ def _face(numbers, x, y, z, point, name):
     for k in range(3):
         axis = k if abs(direction[k]) > abs(direction[axis]) else axis
     one, two = (axis + 1) % 3, (axis + 2) % 3
-    flat_one = numbers[3 if axis == 2 or one == 2 else 4] > 2.0
-    flat_two = numbers[3 if axis == 2 or two == 2 else 4] > 2.0
+    n_one, n_two = numbers[3 if axis == 2 or one == 2 else 4], numbers[3 if axis == 2 or two == 2 else 4]
+    flat_one, flat_two = n_one > 2.0, n_two > 2.0
+    tilt_one, tilt_two = (TILT if n_one <= FLAT else LESS) * flat_one, (TILT if n_two <= FLAT else LESS) * flat_two
     if abs(direction[axis]) < FACING * np.sqrt(x * x + y * y + z * z) or not (flat_one or flat_two):
         return 1, 0.0
     count = 4 if flat_one and flat_two else 2
@@ -71,8 +74,7 @@ def _face(numbers, x, y, z, point, name):
         for n in range(3):
             name[k], point[k, n] = k, 0.0
         point[k, axis] = np.copysign(1.0, direction[axis])
-        point[k, one] = TILT * ahead if flat_one else 0.0
-        point[k, two] = TILT * (beside if flat_one else ahead) if flat_two else 0.0
+        point[k, one], point[k, two] = tilt_one * ahead, tilt_two * (beside if flat_one else ahead)
         point[k, 0], point[k, 1], point[k, 2] = _support(numbers, 0.0, point[k, 0], point[k, 1], point[k, 2])
     return count, numbers[two if flat_one else one] ** 2 / numbers[axis] if count == 2 else 0.0
 

@@ -161,6 +161,21 @@ def test_superellipsoids_rock_on_ends_of_cylinders_without_overlaps():
             assert overlap(sim) <= 2.0 * sim.expected_overlap
 
 
+@pytest.mark.parametrize("n", [8, 20])
+def test_superellipsoids_stand_on_flat_sides_or_slide_by_friction(n):
+    """A step does not follow how they rock there; so they make no energy of that."""
+    for over in (0.9, 1.1):
+        tangent, half = 0.4 * over, 0.05
+        gravity = 9.81 * np.array([tangent, 0, -1]) / np.hypot(tangent, 1)
+        scene = Scene(0.4, gravity=gravity)
+        scene.add_body("floor", [Plane((0, 0, 1))])
+        scene.add_grains([(0, 0, half)], Superellipsoid((2 * half, 2 * half, half), (n, n)), 1000.0)
+        with pctt.Simulation(scene) as sim:
+            sim.run(steps=60)
+            speed = sim.time * max(0.0, gravity[0] + 0.4 * gravity[2])
+            assert sim.velocities[0] == pytest.approx([speed, 0, 0, 0, 0, 0], abs=3e-3)
+
+
 def bed(side, layers):
     """Cylinders, superellipsoids, balls, boxes and capsules above a box of walls."""
     rng, wide = np.random.default_rng(11), 0.25
