@@ -80,6 +80,7 @@ class ConeProblem:
     size : contacts on all ranks, Nc
     unanswered : contacts on all ranks that no impulse moves: N has zeros in their rows
     mean_diagonal : mean of the diagonal of N without compliance (1/kg); 1 for a problem without contacts
+    spread : the greatest over the least normal number of the diagonal of N that is above zero; 0 without contacts
     """
 
     @known_arguments()
@@ -128,13 +129,16 @@ class ConeProblem:
         self.diagonal = _diagonals(blocks) + self.compliance
         soft, rigid, unanswered = _rows_with(self.diagonal, self.compliance, self.cones.count)
         here = wrong, self.cones.count, soft, rigid, unanswered, self.r.size, trace
-        (*counts, trace), _ = reduced(comm, here, ())
+        normal = self.diagonal[: self.cones.count, 0]
+        normal = normal[normal > 0.0]
+        ends = normal.max(initial=0.0), -normal.min(initial=np.inf)
+        (*counts, trace), (most, least) = reduced(comm, here, ends)
         wrong, self.size, soft, rigid, self.unanswered, rows = map(int, counts)
         if wrong:
             self.destroy()
             raise ValueError(f"G has a NaN or an infinite number in {wrong} contacts")
         self.yields, self.all_yield = bool(soft), soft > 0 and not rigid
-        self.mean_diagonal = trace / rows if trace > 0.0 else 1.0
+        self.mean_diagonal, self.spread = trace / rows if trace > 0.0 else 1.0, most / -least
 
     def __repr__(self) -> str:
         given = "N" if self.contact_map is None else "G"

@@ -11,6 +11,10 @@ once more, by itself.
 Nor may impacts have errors, where bodies do little else: APGD, which stops on its way past the solution, leaves all of
 them too strong, and a gas that loses nothing gains some per cent of its energy in a second.
 
+The natural residual has one step and one norm for all contacts. Where masses are unlike, it does not see whether heavy
+bodies slide as friction wants, and light ones may be thrown up by what it allows. So there a step is judged in the
+units of each contact, too, and goes on where it falls short.
+
 Many contacts may need more iterations than that is worth, in a bed, say. So the iterations beyond the limits are
 counted (`World.spare`): so many as SPARE, and a SHARE of all iterations, may lead nowhere.
 """
@@ -29,14 +33,16 @@ from dem.model.world import World
 from dem.record.energies import add_kinetic
 from dem.step.islands import contacts_at_rest
 from dem.step.system import ContactSystem
-from pctt.arrays import Array
-from pctt.ccp import ConeProblem, Limits, Result, with_part
+from pctt.arrays import TINY, Array
+from pctt.ccp import RELAXATION, ConeProblem, Limits, Result, with_part
 
 Solve = Callable[[ConeProblem, Array, Limits], Result]
 
 SLOW = 0.3  #: kinetic energy of bodies at rest, over that of a step of free fall: loose steps shake them by 0.2
 STILL = 2e-3  #: the same where many contacts are worth iterations: beds that settle have 0.004 to 0.07
 AIM = 1e-4  #: residual to go on to, over that of the limits: with 1e-3 boxes with masses 1 : 1e4 creep by 4 um/s
+UNLIKE = 100.0  #: greatest over least number of the diagonal of N: of spheres with radii 1 : 3 it is about 50
+LOOSER = 10.0  #: tolerance in units of each contact, over the natural one: with 1 beds of radii 1 : 6 take 1.6 times
 ATTEMPT = 100  #: iterations beyond the limits in a step, of more than few contacts
 SPARE = World.spare  #: and all that may lead nowhere: a wall of 144 boxes takes 2,400 until each step needs 20
 SHARE = 0.1  #: and this part of all iterations
@@ -76,6 +82,35 @@ def with_islands(
     whole = with_part(problem, found, rows, finer)
     assert whole.accuracy is not None
     return whole if whole.residual_of(whole.accuracy) <= limits.tol else found.after(finer)
+
+
+def with_unlike_masses(problem: ConeProblem, limits: Limits, solve: Solve, found: Result) -> Result:
+    """The result, or what ``solve`` makes of it beyond the limits where masses are unlike, and it is far from a
+    solution in the units of each contact. Collective."""
+    if not found.converged or problem.spread <= UNLIKE:
+        return found
+    assert found.accuracy is not None
+    over = _over_limits(problem, limits, found)
+    if over <= 1.0:
+        return found
+    aim = 0.5 / over * found.residual_of(found.accuracy) / limits.tol
+    finer = solve(problem, found.impulse, limits.but(aim=aim, spare=ATTEMPT))
+    return finer.after(found) if finer.converged else found.after(finer)
+
+
+def _over_limits(problem: ConeProblem, limits: Limits, found: Result) -> float:
+    """The natural residual with steps of 1 / diag N, and norms that these weigh, over the tolerance; or the greatest
+    speed [m/s] that its own impulse gives a contact that opens, over that of closing. Collective."""
+    N = problem.diagonal[: problem.cones.count, 0]
+    N = np.where(N > 0.0, N, problem.mean_diagonal)
+    g, weight = found.impulse, N[:, None]
+    y = problem.velocity_of(found.momentum) + problem.compliance * g + problem.r
+    steps = np.tile(1.0 / weight, (problem.cones.parts, 1))
+    move = problem.cones.move(g, y, steps, found.law != RELAXATION)[: len(N)]
+    y, g = y[: len(N)], g[: len(N)]
+    moved, whole = problem.sums(float((weight * move**2).sum()), float((weight * g**2).sum()))
+    opens = problem.max(float(np.minimum(y[:, 0], N * g[:, 0]).max(initial=0.0)))
+    return max(np.sqrt(moved / max(whole, TINY)) / (LOOSER * limits.tol), opens / limits.closing_speed)
 
 
 def account(world: World, limits: Limits, result: Result) -> None:

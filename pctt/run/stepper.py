@@ -210,6 +210,7 @@ class Stepper:
             rest.account(world, limits, result)
             of_parts = partial(self._by, newton=None if self.newton is None else self.newton.of_parts)
             result = rest.with_islands(world, system, problem, guess, limits, of_parts, result)
+            result = rest.with_unlike_masses(problem, limits, partial(self._by, newton=self.newton), result)
         return result if before is None else result.after(before)
 
     def _by(

@@ -78,3 +78,20 @@ def test_a_block_slides_when_its_friction_is_made_less_and_a_checkpoint_keeps_it
     with Simulation.load(tmp_path / "slides.h5", scene, dt=0.01, tol=1e-8, comm=MPI.COMM_SELF) as again:
         again.run(steps=10)
         assert again.velocities[0, 0] == pytest.approx(0.2 * 9.81 * (np.sin(tilt) - 0.1 * np.cos(tilt)), rel=1e-5)
+
+
+def test_light_bodies_on_and_beside_a_heavy_one_that_slides_are_not_thrown_up():
+    """The tolerance is relative to all impulses, of which those of a body of a millionth of the mass are no part."""
+    slope, half = np.pi / 4, 0.01
+    scene = Scene(0.2, gravity=(G * np.sin(slope), 0, -G * np.cos(slope)))
+    scene.add_body("slope", [Plane((0, 0, 1))])
+    scene.add_boxes([0, 3, 0.5], (0.5, 0.5, 0.5), 8000.0)
+    scene.add_boxes([[0, 3, 1 + half], [0, 0, half]], (half, half, half), 1000.0)
+    scene.add_spheres([0, -1, half], half, 1000.0)
+    with Simulation(scene, dt=0.003) as sim:
+        start = sim.positions
+        for _ in range(60):
+            sim.step()
+            assert (sim.positions - start)[1:, 2] == pytest.approx(np.zeros(3), abs=0.02 * half)
+        speed = G * (np.sin(slope) - 0.2 * np.cos(slope)) * sim.time
+        assert sim.velocities[:, 0] == pytest.approx(np.full(4, speed), rel=2e-2)
