@@ -127,12 +127,9 @@ class ConeProblem:
         known = self.contact_map is not None and math.isfinite(trace)
         wrong = 0 if known else _not_finite(blocks)
         self.diagonal = _diagonals(blocks) + self.compliance
-        soft, rigid, unanswered = _rows_with(self.diagonal, self.compliance, self.cones.count)
+        soft, rigid, unanswered, most, least = _rows_with(self.diagonal, self.compliance, self.cones.count)
         here = wrong, self.cones.count, soft, rigid, unanswered, self.r.size, trace
-        normal = self.diagonal[: self.cones.count, 0]
-        normal = normal[normal > 0.0]
-        ends = normal.max(initial=0.0), -normal.min(initial=np.inf)
-        (*counts, trace), (most, least) = reduced(comm, here, ends)
+        (*counts, trace), (most, least) = reduced(comm, here, (most, -least))
         wrong, self.size, soft, rigid, self.unanswered, rows = map(int, counts)
         if wrong:
             self.destroy()
@@ -409,19 +406,22 @@ def compliances(compliance: Array | float, contacts: int, rows: int) -> Array:
 
 
 @loop
-def _rows_with(diagonal: Array, compliance: Array, contacts: int) -> tuple[int, int, int]:
+def _rows_with(diagonal: Array, compliance: Array, contacts: int) -> tuple[int, int, int, float, float]:
     """How many rows (n, 3) of C have compliance, how many of the first ones, of so many contacts, have none along the
-    normal, and in how many rows the diagonal of N (n, 3) is zero."""
-    soft, rigid, unanswered = 0, 0, 0
+    normal, and in how many rows the diagonal of N (n, 3) is zero; and the greatest and the least of its normal numbers
+    above zero, of contacts."""
+    soft, rigid, unanswered, most, least = 0, 0, 0, 0.0, np.inf
     for c in range(len(compliance)):
         rigid += c < contacts and not compliance[c, 0] > 0.0
+        if c < contacts and diagonal[c, 0] > 0.0:
+            most, least = max(most, diagonal[c, 0]), min(least, diagonal[c, 0])
         gives = False
         answers = False
         for k in range(3):
             gives = gives or compliance[c, k] > 0.0
             answers = answers or diagonal[c, k] != 0.0
         soft, unanswered = soft + gives, unanswered + (not answers)
-    return soft, rigid, unanswered
+    return soft, rigid, unanswered, most, least
 
 
 def _number(x: float) -> float:
