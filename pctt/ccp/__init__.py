@@ -172,7 +172,7 @@ def _by(
             found = _enough(problem, guess, limits, coulomb) if method.needs == NEWTON else None
             if found is None and coulomb and method.has_law:
                 found = run(problem, guess, limits, *given, coulomb=True)
-            # conic's own systems of Coulomb's law are those of bodies, or of few contacts
+            # conic has no systems of Coulomb's law where options name their solver, or N has no entries
             if coulomb and (found is None or (found.status is Status.GIVEN_UP and problem.contact_map is None)):
                 result = fixed_point(lambda *convex: run(*convex, *given), problem, guess, limits)
             else:

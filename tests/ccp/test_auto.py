@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from mpi4py import MPI
-from problems import SELF, from_graph, heap, part
+from problems import SELF, from_graph, from_matrix, heap, known_optimum, part
 from test_unbounded import squeezed
 
 from pctt import ccp
@@ -101,6 +101,20 @@ def test_cone_problems_from_the_best_impulses_solve_what_all_else_left():
             assert problem.natural_residual(known.g, known.y + r - known.r, coulomb=True) < 1e-9
             solved += ccp.solve(problem).converged
     assert solved >= 6
+
+
+@pytest.mark.parametrize("few", [0, 1000])
+def test_a_given_matrix_that_fills_its_factors_is_no_case_for_cone_problems(few, monkeypatch):
+    """150 contacts of a full matrix without bodies, and without contacts that are few: the conic method finds the law
+    by itself, in as many iterations as that of the bodies would."""
+    monkeypatch.setattr(by_elimination, "FEW", few)
+    rng, contacts = np.random.default_rng(5), 150
+    G = rng.normal(size=(3 * contacts, 3 * contacts))
+    known = known_optimum(6, G @ G.T, rng.uniform(0.0, 1.0, contacts))
+    result = ccp.solve(from_matrix(known), type="conic", limits=Limits(1e-6, fallback=False))
+    assert (result.converged, result.cone_problems, result.law) == (True, 1, ccp.COULOMB)
+    assert result.iterations < 30
+    assert ccp.measure(from_matrix(known), result.impulse).coulomb_residual < 1e-6
 
 
 def test_the_iterations_of_apgd_grow_with_size_and_accuracy():

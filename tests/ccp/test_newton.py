@@ -300,15 +300,46 @@ def test_contacts_that_would_fill_the_factors_are_not_few(monkeypatch):
 
 
 @pytest.mark.parametrize("few", [400], indirect=True)
-def test_where_these_factors_fail_a_ksp_takes_over(monkeypatch):
+def test_an_elimination_may_be_dear_where_no_bodies_are_known(monkeypatch):
+    """Then no other factors are cheaper, but APGD may be."""
+    monkeypatch.setattr(elimination, "LEAST", 1)
+    monkeypatch.setattr(by_elimination, "PAIRS", 20)
+    newton, problem = ccp.Newton(SELF, "body"), from_matrix(heap(3)[0])
+    newton.begin(problem)
+    assert isinstance(newton.linear, by_elimination.ByElimination)
+    assert not newton.has_elimination(problem)
+    newton.destroy()
+
+
+@pytest.mark.parallel(1, 2)
+def test_systems_of_a_given_matrix_may_be_unsymmetric():
+    """Few or many, on one rank or on several."""
+    known, (barrier, q) = heap(3)[0], barrier_and_side()
+    barrier[:, 0] *= 1.5
+    here, newton = part(MPI.COMM_WORLD, len(q)), ccp.Newton(MPI.COMM_WORLD, "body")
+    newton.begin(from_matrix(known, MPI.COMM_WORLD))
+    assert newton.linear.takes_unsymmetric
+    newton.update(barrier[here], symmetric=False)
+    dg, _ = newton.solve(q[here], 1e-9)
+    exact = np.linalg.solve(known.N + block_diag(*barrier), q.ravel()).reshape(-1, 3)
+    assert np.allclose(dg, exact[here], rtol=0, atol=1e-8 * np.linalg.norm(exact))
+    assert newton.linear.fallbacks == 0
+    newton.destroy()
+
+
+@pytest.mark.parametrize("few", [400], indirect=True)
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_where_these_factors_fail_a_ksp_takes_over(symmetric, monkeypatch):
     monkeypatch.setattr(Factors, "solve", lambda self, b, wanted: (b, 0))
     known, graph = heap(3)
     barrier, q = barrier_and_side()
+    if not symmetric:
+        barrier[:, 0] *= 1.5
     S = known.N + block_diag(*barrier)
     newton = ccp.Newton(SELF, "body")
     newton.begin(from_graph(known, graph))
     for times in (1.0, 2.0):
-        newton.update(times * barrier)
+        newton.update(times * barrier, symmetric=symmetric)
         dg, _ = newton.solve(q, 1e-9)
         left = S @ dg.ravel() + (times - 1.0) * block_diag(*barrier) @ dg.ravel() - q.ravel()
         assert np.linalg.norm(left) <= 2e-9

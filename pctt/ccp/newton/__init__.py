@@ -23,7 +23,7 @@ from mpi4py import MPI
 from dem.exchange import on_any
 from pctt.arrays import Array
 from pctt.ccp.delassus import GivenMatrix
-from pctt.ccp.newton.by_elimination import ByElimination, has_few, matrix_of, order_of
+from pctt.ccp.newton.by_elimination import GIVEN_MORE, ByElimination, has_few, is_cheap, matrix_of, order_of
 from pctt.ccp.newton.by_factors import ByFactors
 from pctt.ccp.newton.by_ksp import ByKSP
 from pctt.ccp.newton.compare import Comparison
@@ -100,7 +100,8 @@ class Newton:
             defaults = GIVEN if given and entries else DEFAULTS["contact" if given else self.form]
             free = self.compare is None and OWN + "pc_type" not in options_database()
             incomplete = self.form == "contact" and free and entries
-            self._linear = ByKSP(self.comm, self._room, defaults, self.compare, incomplete, entries)
+            lu = self.own and entries  # of a given N
+            self._linear = ByKSP(self.comm, self._room, defaults, self.compare, incomplete, entries, lu)
 
     @property
     def own(self) -> bool:
@@ -119,8 +120,8 @@ class Newton:
         return has_few(problem) and self.own
 
     def has_elimination(self, problem: ConeProblem) -> bool:
-        """Whether the systems of this problem are solved by elimination."""
-        return self._look(problem.by_rows())[1] is not None
+        """Whether the systems of this problem are solved by elimination, and that is cheap."""
+        return is_cheap(self._look(problem.by_rows())[1])
 
     def _look(self, problem: ConeProblem) -> tuple[tuple, Order | None]:
         """The structure of a problem, and an order of elimination if its contacts are few. Both are those of the last
@@ -129,7 +130,9 @@ class Newton:
         if looked is not problem.operator:
             found = problem.structure()
             if not (len(found) == len(structure) and all(map(np.array_equal, found, structure))):
-                structure, order = found, order_of(self._matrix(problem)) if self.own and has_few(problem) else None
+                structure, order = found, None
+                if self.own and has_few(problem):
+                    order = order_of(self._matrix(problem), GIVEN_MORE if problem.contact_map is None else 1)
             self._seen = problem.operator, structure, order
         return structure, order
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 FEW = 1000  # contacts up to which an order of elimination is looked for
 PAIRS = 100_000  # pairs of blocks in an elimination at most: 20 ns each
 REST = 133  # contacts in the dense rest at most: 1 ms
+GIVEN_MORE = 100  # times the pairs, and any rest, where no bodies are known: PETSc's factors take longer
 
 
 def has_few(problem: ConeProblem) -> bool:
@@ -40,9 +41,16 @@ def matrix_of(problem: ConeProblem) -> GivenMatrix | None:
     return GivenMatrix(problem.comm, all_blocks(G))
 
 
-def order_of(N: GivenMatrix | None) -> Order | None:
-    """An order of elimination; None if none is cheap."""
-    return None if N is None else ordered(N.local.indptr, N.local.indices, PAIRS, REST)
+def order_of(N: GivenMatrix | None, more: int = 1) -> Order | None:
+    """An order of elimination; None if none is cheap. With ``more`` it may have so many times as many pairs, and any
+    rest."""
+    most_rest = REST if more == 1 else FEW
+    return None if N is None else ordered(N.local.indptr, N.local.indices, more * PAIRS, most_rest)
+
+
+def is_cheap(order: Order | None) -> bool:
+    """Whether an elimination is one that `order_of` finds by itself."""
+    return order is not None and len(order.target) <= PAIRS and order.rest <= REST
 
 
 class ByElimination:

@@ -28,14 +28,16 @@ class ByKSP(Iterative):
     incomplete : whether incomplete factors take over from block Jacobi while that would take long. Systems are hard in
         the middle of a problem. The choice rests on iteration counts, so that a repeated run repeats it
     entries : whether systems have them: else nothing but a KSP works on them
+    unsymmetric : whether it `takes_unsymmetric` systems
     """
 
     def __init__(
         self, comm: MPI.Comm, room: Room, defaults: Options, compare: Comparison | None = None,
-        incomplete: bool = False, entries: bool = True,
+        incomplete: bool = False, entries: bool = True, unsymmetric: bool = False,
     ):  # fmt: skip
         super().__init__(comm, room, defaults)
         self.compare, self.incomplete, self._entries = compare, incomplete, entries
+        self.takes_unsymmetric = unsymmetric
         self.begin()
 
     def begin(self) -> None:

@@ -10,8 +10,8 @@ DEFAULTS: dict[str, Options] = {
 }
 #: of a problem that is given by N: a solve as accurate as that of the bodies would be
 GIVEN: Options = {"ksp_type": "gmres", "pc_type": "cholesky"}
-#: of systems that are not symmetric, which conjugate gradients do not take
-UNSYMMETRIC: Options = {"ksp_type": "bcgs"}
+#: in place of these, by the preconditioner, for systems that are not symmetric
+UNSYMMETRIC: dict[str, Options] = {"pbjacobi": {"ksp_type": "bcgs"}, "cholesky": {"pc_type": "lu"}}
 #: where block Jacobi takes long on contacts
 INCOMPLETE: Options = {"pc_type": "python", "pc_python_type": "pctt.pc.BlockICC"}
 #: where a KSP fails: factors, by whether the matrix is symmetric

@@ -109,13 +109,18 @@ class ContactForm(Form):
         self._barrier, self._current = barrier, False
 
     def _take_values(self) -> None:
-        self._local = np.empty((len(self._barrier), 6))
-        pack(self._barrier + self.problem.compliance_blocks, self._local)
-        set_diagonal_blocks(self._mat, self.blocks)
+        self._local = self._barrier + self.problem.compliance_blocks
+        if self.symmetric:
+            self._local, blocks = np.empty((len(self._local), 6)), self._local
+            pack(blocks, self._local)
+        set_diagonal_blocks(self._mat, self.blocks, self.symmetric)
 
     def _product(self, g: Array, out: Array) -> None:
         g, out = g.reshape(-1, 3), out.reshape(-1, 3)
-        local_product(self._local, g, out)
+        if self.symmetric:
+            local_product(self._local, g, out)
+        else:
+            out[:] = self.problem.cones.times(self._local, g)
         PETSc.Log.logFlops(5 * g.size)
         self.problem.operator.add_delassus(g, out)
 

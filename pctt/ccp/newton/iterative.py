@@ -104,7 +104,7 @@ class Iterative:
         """A Krylov method by its name, made when it is first needed. Systems that are not symmetric have others."""
         symmetric = self._symmetric
         if (name, symmetric) not in self._made:
-            own = self.defaults if symmetric else {**self.defaults, **UNSYMMETRIC}
+            own = self.defaults if symmetric else {**self.defaults, **UNSYMMETRIC[self.defaults["pc_type"]]}
             self._made[name, symmetric] = Krylov(self.comm, OWN, {**own, **options})
         return self._made[name, symmetric]
 
