@@ -27,6 +27,7 @@ import numpy as np
 from dem.exchange import broadcast
 from pctt.arrays import Array
 from pctt.ccp import gathered
+from pctt.ccp.accuracy import figures
 from pctt.ccp.coulomb import fixed_point
 from pctt.ccp.first_order import apgd
 from pctt.ccp.interior import conic
@@ -42,6 +43,7 @@ USUAL_CONIC = conic.Conic()
 PLAIN = apgd.APGD(damping=1.0, near=1.0)  # without momentum
 SHORT = conic.Conic(start=1.0, boundary_with_law=0.5)
 TERMS = {"most": 60, "depth": 2}  # cone problems for given De Saxce terms, where all else has failed
+GREAT = (Status.UNBOUNDED, Status.SQUEEZED)  # of impulses that may have grown
 GROWN = 1e9  # of the impulses that the data suggest: no mass ratio that is solved asks for as much
 
 
@@ -70,28 +72,34 @@ def solve(
 ) -> Result:
     """Impulses, of the cone problem or of Coulomb's law; ``solver`` of the result names the method that found them."""
     tried = Attempts(problem, limits, newton, coulomb)
-    small = problem.size <= by_elimination.FEW
+    small = tried.small
     first, few = tried.begin(guess, options)
     if first.converged and first.residual > limits.aimed:
         tried.beyond(guess, few)
-    elif not (first.converged or first.final or first.exhausted) and first.iterations < limits.max_it:
+    elif not (_ended(first) or first.exhausted) and first.iterations < limits.max_it:
         if not coulomb:
             start = min(USUAL_CONIC.start, options.start * first.residual)
             tried.conic(first.impulse, replace(USUAL_CONIC, start=start))
         else:
             basin = max(limits.tol, options.basin)
             second = tried.conic(guess, USUAL_CONIC, 0.0 if small else basin)
-            grown = second.status is Status.UNBOUNDED  # its path has left those of the law, which may have a solution
+            grown = second.status in GREAT  # its path has left those of the law, which may have a solution
             failed = small and not grown and second.status is not Status.GIVEN_UP and second.residual > basin
             if failed and problem.norm(guess) > 0.0:  # a guess at the wall of its cones
                 second = tried.conic(np.zeros_like(guess), USUAL_CONIC)
             if failed and second.residual > basin:
                 tried.in_turns(options, basin)
             elif grown or not (small and second.final):
-                tried.apgd(second.impulse if second.iterations and not grown else first.impulse, limits.max_it)
+                begun = guess if first.status in GREAT else first.impulse
+                tried.apgd(second.impulse if second.iterations and not grown else begun, limits.max_it)
             if small and second.status is not Status.GIVEN_UP and not tried.all[-1].converged:
                 tried.at_last(guess)
     return tried.result()
+
+
+def _ended(result: Result) -> bool:
+    """Whether another attempt would be in vain."""
+    return result.final and result.status is not Status.SQUEEZED
 
 
 class Attempts:
@@ -100,6 +108,7 @@ class Attempts:
     def __init__(self, problem: ConeProblem, limits: Limits, newton: Newton, coulomb: bool):
         self.problem, self.limits, self.newton, self.coulomb = problem, limits, newton, coulomb
         self.all: list[Result] = []
+        self.small = problem.size <= by_elimination.FEW
         self.most = min(CONIC_ITERATIONS, limits.max_it)
         self.gathers = gathered.takes(problem, newton)
 
@@ -115,7 +124,8 @@ class Attempts:
 
     def keep(self, result: Result, solver: str) -> Result:
         """Note a result. Impulses of self-stress may grow in Coulomb's law until their rounding throws bodies away, and
-        the natural residual, which is relative to them, falls: such impulses are none."""
+        the natural residual, which is relative to them, falls: such impulses are none. Where they are squeezed in a
+        small problem, the residual is that of their works."""
         result.solver, result.newton_its = solver, result.iterations if solver == "conic" else 0
         if self.coulomb and self.problem.norm(result.impulse) > GROWN * self.usual:
             if why := why_unbounded(self.problem, result.impulse):
@@ -124,6 +134,12 @@ class Attempts:
                 result.status, result.residual = Status.STALLED, np.inf
                 result.reason = f"impulses grow beyond {GROWN:g} times the size that r and N suggest"
                 result.impulse = np.zeros_like(result.impulse)
+        if self.coulomb and self.small and result.converged:
+            rigid = self.problem.velocity_of(self.problem.momentum(result.impulse))
+            found = figures(self.problem, result.impulse, rigid)
+            if words := self.limits.squeezed(found, coulomb=True):
+                result.status, result.reason = Status.SQUEEZED, words
+                result.residual = self.limits.excess(max(found.closing_work, found.opening_work), found.closing_speed)
         self.all.append(result)
         return result
 
@@ -185,7 +201,7 @@ class Attempts:
         relaxation, and cone problems that begin there."""
         for turn in range(options.turns):
             most = options.plain * 2**turn
-            if self.apgd(self.best.impulse, most, PLAIN).final or self.conic(self.best.impulse, SHORT).final:
+            if _ended(self.apgd(self.best.impulse, most, PLAIN)) or _ended(self.conic(self.best.impulse, SHORT)):
                 return
             if self.best.residual <= basin:
                 self.apgd(self.best.impulse, self.limits.max_it)
@@ -200,8 +216,8 @@ class Attempts:
     def at_last(self, guess: Array) -> None:
         """What is left for the best impulses, or the guess where impulses have grown: APGD, where it has not just been
         tried, the cone problems of their De Saxce terms, and shorter steps of the conic method."""
-        if self.all[-1].solver != "apgd":
-            grown = self.all[-1].status is Status.UNBOUNDED
+        grown = self.all[-1].status in GREAT
+        if grown or self.all[-1].solver != "apgd":
             self.apgd(guess if grown else self.best.impulse, self.limits.max_it)
         if not self.all[-1].converged:
             self.by_terms(self.best.impulse)

@@ -64,11 +64,15 @@ class Limits:
         """What ``tol`` is for: the natural residual, or the closing or opening work, or the closing speed, each in
         units in which its limit is ``tol``, whichever is largest. It is at most ENOUGH times the natural residual:
         where bodies are squeezed no accuracy may bring the others below their limits. What passes so is `squeezed`."""
-        worst = errors.natural
-        for error, limit in (errors.work, self.closing_work), (errors.speed, self.closing_speed):
+        return min(max(errors.natural, self.excess(errors.work, errors.speed)), ENOUGH * errors.natural)
+
+    def excess(self, work: float, speed: float) -> float:
+        """A closing or opening work and a closing speed, as parts of their limits, in units of ``tol``."""
+        worst = 0.0
+        for error, limit in (work, self.closing_work), (speed, self.closing_speed):
             if limit < math.inf:
                 worst = max(worst, self.tol / limit * error)
-        return min(worst, ENOUGH * errors.natural)
+        return worst
 
     def squeezed(self, found: Accuracy, coulomb: bool) -> str:
         """The reason, in words, if impulses of this accuracy meet the limits although their closing or opening work, or
@@ -151,7 +155,7 @@ class Result:
     velocity : the velocities y = N g + r of that shape (m/s); set by `pctt.ccp.solve`
     status : CONVERGED where the residual and the closing work of `Limits` are below theirs, else why not. SQUEEZED:
         bodies are pressed so hard, or have masses so far apart, that the closing work says nothing, or that forces on
-        light bodies are wrong. No other method would do better
+        light bodies are wrong. No other method would do better; with few contacts `auto` has tried that
     reason : what ran and why it ended, in words
     residual : the solver's own last value: the natural residual if the closing work has no limit
     iterations : Newton steps, or steps of first-order methods, of all methods tried

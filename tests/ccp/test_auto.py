@@ -90,17 +90,32 @@ def test_few_contacts_of_several_ranks_are_gathered_once(monkeypatch):
 
 
 def test_cone_problems_from_the_best_impulses_solve_what_all_else_left():
-    """Nine random problems of friction 3 that have a solution of the law: contacts that slide do not open."""
+    """Nine random problems of friction 3 that have a solution of the law."""
     solved = 0
     for contacts, bodies, seeds in (8, 3, (3, 75, 80, 148)), (12, 4, (12, 15, 34, 56, 141)):
         for seed in seeds:
-            known, graph = heap(seed, contacts, bodies, mu=3.0)
-            r, slip = known.r.copy(), 3.0 * np.linalg.norm(known.y[:, 1:], axis=1)
-            r[:, 0] -= np.where(known.g[:, 0] > 0.0, slip, 0.0)
-            problem = ccp.ConeProblem(SELF, r, known.mu, G=graph.part(SELF))
-            assert problem.natural_residual(known.g, known.y + r - known.r, coulomb=True) < 1e-9
-            solved += ccp.solve(problem).converged
+            solved += ccp.solve(with_solution(seed, contacts, bodies, mu=3.0)).converged
     assert solved >= 6
+
+
+def test_squeezed_impulses_are_no_answer_where_others_are():
+    """Of 4 random problems of masses 1 to 1e8 that have a solution of the law, where an attempt grows along impulses
+    that all but cancel on the bodies: the natural residual is relative to them."""
+    given = [(119, 16, 7, 2.0), (1602, 15, 3, 3.0), (1664, 10, 2, 1.0), (1746, 14, 2, 2.0)]
+    results = [ccp.solve(with_solution(*size, mu=mu, mass_ratio=1e8)) for *size, mu in given]
+    assert sum("squeezed" in result.reason for result in results) >= 3
+    assert sum(result.converged for result in results) >= 3
+    assert all(result.accuracy.closing_work <= 0.05 for result in results if result.converged)
+
+
+def with_solution(seed, contacts, bodies, **more):
+    """A random problem that has a solution of Coulomb's law: contacts that slide do not open."""
+    known, graph = heap(seed, contacts, bodies, **more)
+    r, slip = known.r.copy(), known.mu * np.linalg.norm(known.y[:, 1:], axis=1)
+    r[:, 0] -= np.where(known.g[:, 0] > 0.0, slip, 0.0)
+    problem = ccp.ConeProblem(SELF, r, known.mu, G=graph.part(SELF))
+    assert problem.natural_residual(known.g, known.y + r - known.r, coulomb=True) < 1e-9
+    return problem
 
 
 @pytest.mark.parametrize("few", [0, 1000])
