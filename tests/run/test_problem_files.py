@@ -152,7 +152,7 @@ class Row(Experiment):
 @pytest.mark.parametrize(("rolling", "what"), [(0.01, "rolling"), (0.0, "joints")])
 def test_problems_that_no_file_can_hold_are_not_written(program, tmp_path, rolling, what):
     (tmp_path / "row.py").write_text(UNWRITTEN.replace("ROLLING", str(rolling)))
-    given = ("-scene", "row.py", "-dt", 0.01, "-ccp_tol", 1e-9, "-ccp_max_it", 1, "-steps", 3)
+    given = ("-scene", "row.py", "-dt", 0.01, "-ccp_max_it", 1, "-ccp_fallback", "false", "-steps", 3)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         program(*given, "-output", "kept")
