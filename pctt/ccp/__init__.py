@@ -189,11 +189,12 @@ def _by(
     if problem.sum(int(not all_from(result.impulse.ravel(), -np.inf))):
         result.reason = f"impulses are no numbers: {result.reason}"
         result.impulse, result.status, result.residual = np.zeros(problem.r.shape), Status.BREAKDOWN, cold
+        result.accuracy = None
     elif unbounded := why_unbounded(problem, result.impulse):
         result.status, result.reason = Status.UNBOUNDED, unbounded
     elif result.converged and (indefinite := why_indefinite(problem)):
         result.status, result.reason, result.exhausted = Status.BREAKDOWN, indefinite, True
-    accuracy = _measure(problem, result)
+    accuracy = result.accuracy or _measure(problem, result)  # which `auto` may have done
     if result.converged and (squeezed := limits.squeezed(accuracy, coulomb)):
         result.status, result.reason = Status.SQUEEZED, squeezed
     return result

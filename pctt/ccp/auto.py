@@ -135,8 +135,9 @@ class Attempts:
                 result.reason = f"impulses grow beyond {GROWN:g} times the size that r and N suggest"
                 result.impulse = np.zeros_like(result.impulse)
         if self.coulomb and self.small and result.converged:
-            rigid = self.problem.velocity_of(self.problem.momentum(result.impulse))
-            found = figures(self.problem, result.impulse, rigid)
+            result.momentum = self.problem.momentum(result.impulse)
+            found = figures(self.problem, result.impulse, self.problem.velocity_of(result.momentum))
+            result.accuracy = found
             if words := self.limits.squeezed(found, coulomb=True):
                 result.status, result.reason = Status.SQUEEZED, words
                 result.residual = self.limits.excess(max(found.closing_work, found.opening_work), found.closing_speed)
