@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 #: Bodies that contacts turned by more radians in the last step were struck: those impulses do not come again.
 STRUCK = 0.05
 MADE = 0.01  #: energy that impacts may make, as a part of what their impulses exchange, before they bounce less
+MUCH = 0.1  #: the same, before they have no friction, where they cannot bounce less
 PARTS = np.array([0.0, 0.25, 0.5, 0.75, 0.9, 1.0])  #: of e, that are tried from the last to the first
 
 
@@ -86,6 +87,7 @@ class ContactSystem:
         later (nc, 3): what of it they bear in the next step, which `kept` finds and gives bodies at once [N s]
         drives: of the large bodies, the same on all ranks
         strikes (nc,): which contacts are impacts
+        jams: whether the impulses of impacts make much energy, once `eased` has looked
         at_once: how many contacts of this rank bounce with all others of the step, and not in their order
         coupling: by constraints, a `dem.unconstrained.constraints.Coupling`; None if there are none
         applied: what parts give, a `dem.unconstrained.applied.Applied`; None if none do
@@ -262,7 +264,8 @@ class ContactSystem:
         """Contacts that are to bounce less, by key, and with which part of e: the next one for those whose impulses do
         work, where all contacts together, with these impulses (parts nc, 3) and momenta, make energy. Newton's law of
         impacts may do so with friction (Kane and Levinson 1985), and does not at e = 0. None if they make none, or if
-        no part is left; collective."""
+        no part is left; `jams` tells whether it is much of what impacts then exchange. Collective."""
+        self.jams = False
         if not world.pairs.bounces:
             return None
         parts = 1 if self.resistance is None else 2
@@ -270,10 +273,12 @@ class ContactSystem:
         change = self.problem_map.velocities(momentum.reshape(-1, 6)).reshape(g.shape)
         slips = [self._freely if self.surface is None else self._freely + np.pad(self.surface, ((0, 0), (1, 0)))]
         free = np.stack(slips if self.resistance is None else [*slips, self.resistance.velocity])
-        work, exchanged = np.einsum("pci,pci->c", g, free + 0.5 * change), 0.5 * np.einsum("pci,pci->", g, change)
+        work, exchanged = np.einsum("pci,pci->c", g, free + 0.5 * change), 0.5 * np.einsum("pci,pci->c", g, change)
         less = self._bounces & (work > 0.0) & (self._part > 0.0)
-        sums = self.contact_map.comm.allreduce(np.array([work.sum(), exchanged, less.sum()]))
+        here = work.sum(), exchanged.sum(), less.sum(), work[self.strikes].sum(), exchanged[self.strikes].sum()
+        sums = self.contact_map.comm.allreduce(np.array(here))
         if sums[2] == 0.0 or sums[0] <= MADE * sums[1]:
+            self.jams = bool(sums[3] > MUCH * sums[4])
             return None
         self._part[less] = PARTS[np.searchsorted(PARTS, self._part[less]) - 1]
         eased = self._part < 1.0

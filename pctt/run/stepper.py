@@ -161,10 +161,11 @@ class Stepper:
     ) -> tuple[Array, Callable[[], _Attempt] | None]:
         """The velocities (owned, 6) of a solution, and what makes the next attempt if they show that the problem lacks
         something; collective. No result is kept for it: it takes memory while others are made."""
-        # no impulses let bodies bounce as they are to: in a corner friction may press one on a wall as fast as another
-        # sends it off
+        # no impulses let bodies bounce as they are to, or only such as make energy: in a corner friction may press one
+        # on a wall as fast as another sends it off
+        smooth = partial(replace, attempt, free=system.motion, smooth=True, before=result.cost)
         if not attempt.smooth and result.status is ccp.Status.UNBOUNDED and world.pairs.bounces:
-            return np.zeros((0, 6)), partial(replace, attempt, free=system.motion, smooth=True, before=result.cost)
+            return np.zeros((0, 6)), smooth
         other = less = None
         with log.phase("search"):  # bodies that meet unforeseen
             system.set_rate(world, result.momentum)
@@ -175,6 +176,8 @@ class Stepper:
                 other = system.refound(world, result.impulse, velocity)
             if missed is other is None:  # impacts that would make energy
                 less = system.eased(world, result.impulse, result.momentum)
+                if less is None and system.jams and not attempt.smooth:
+                    return velocity, smooth
         if missed is other is less is None:
             return velocity, None
         more: dict[str, Any] = {
