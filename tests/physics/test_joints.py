@@ -129,6 +129,23 @@ def test_a_heavy_load_swings_on_a_light_chain():
     assert np.ptp(energy) < 2e-3 * (ends[-1, 0] + load) * (1.0 - np.cos(0.3))
 
 
+@pytest.mark.parametrize("load", [10.0, 5e3])
+def test_a_light_chain_that_swings_does_not_burst(load):
+    """Of ten links of 7 g each, from the horizontal: the load falls on a circle, at any ratio of masses."""
+    scene, upright, last = Scene(0.4), (0.5**0.5, 0, 0.5**0.5, 0), None
+    places = [[0.1 * k + 0.05, 0, 0] for k in range(10)]
+    links = [int(scene.add_capsules(at, 0.005, 0.04, 1000.0, quaternions=upright)[0]) for at in places]
+    ball = scene.add_spheres([1.2, 0, 0], 0.2, load / (4 / 3 * np.pi * 0.2**3))
+    for k, link in enumerate([*links, int(ball[0])]):
+        scene.add_joint(f"pin {k}", last, link, kind="ball", anchor=(0.1 * k, 0, 0))
+        last = link
+    sim = pctt.Simulation(scene, dt=2.5e-3)
+    sim.run(until=0.6)
+    assert np.linalg.norm(sim.positions[-1]) == pytest.approx(1.2, rel=1e-3)
+    assert sim.kinetic_energy == pytest.approx(-load * G * sim.positions[-1, 2], rel=0.03)
+    assert np.abs(sim.local.velocity[:-1, 3:]).max() < 50.0
+
+
 def test_a_slider_crank_moves_as_its_geometry_says():
     """Joints and motor have 21 rows for the 18 velocities of three bodies: some are redundant."""
     crank, rod = 0.3, 1.0
