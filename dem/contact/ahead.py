@@ -15,10 +15,11 @@ Arms are another matter. The impulse J of a step acts at its start, between two 
 their mean at the end of the arm, whatever arm it has. With the arm r of the start, a point that rests has the velocity
 -dt/2 w x (w x r) by the later spin w, and +dt/2 w x (w x r) by the one before: no work, to second order. With that of
 the end (or of the middle) both have the same sign, and each step brakes a body that spins on a corner. So bodies have
-the arms of the start, both to one place: angular momentum is kept. What the arms then miss of the way that surfaces go
-along each other in the step, the term with dt/2, is foreseen and added (`Contacts.swing`): a body that turns together
-with another one does not creep on it. Bodies of prescribed motion have the arms of the end, as normals: a tool does the
-work that its force does at the speed of its face.
+the arms of the start, both to one place: angular momentum is kept. Curved surfaces lead to two places there, as they
+slide along each other until the end: the place is half way between these. What the arms then miss of the way that
+surfaces go along each other in the step, the term with dt/2, is foreseen and added (`Contacts.swing`): a body that
+turns together with another one does not creep on it. Bodies of prescribed motion have the arms of the end, as normals:
+a tool does the work that its force does at the speed of its face.
 
 Large round bodies on a flat face that impulses move have its normal of the start, too. The normal turns with the face,
 and the place goes along the face as it rolls on them: with the normal of the end, and arms along it, each step would
@@ -186,7 +187,7 @@ def turn_ahead(
         lasts &= given or (flat and dot(arc, arc) > 0.0) or (guest.kind == SPHERE and host.kind == SPHERE)
         n = start if lasts else n
 
-        # The arms of the start; on flat faces both lead to one place.
+        # The arms of the start, of two bodies that impulses move to one place; of two spheres they go along the normal.
         core = guest.center if here else after_turn(plus(arm, -1.0, arc), guest.spin, -h)
         seat = host.center if host.kind == SPHERE else after_turn(plus(other, -1.0, bow), host.spin, -h)
         early, there = guest.moves or lasts, arm
@@ -195,6 +196,10 @@ def turn_ahead(
             seat = plus(arm, 1.0, apart) if flat else seat
         if host.moves:
             other = plus(seat, 1.0, first_bow)
+        one_place = not given and (host.kind != SPHERE or dot(core, core) + dot(host.center, host.center) > 0.0)
+        if one_place and not flat:  # else impulses on two bodies had a torque on both together
+            across = plus(plus(other, -1.0, arm), -1.0, apart)
+            arm, other = plus(arm, 0.5, across), plus(other, -0.5, across)
         linear[c] = end - h * dot(n, plus(_velocity_at(host, other), -1.0, _velocity_at(guest, arm)))
         if h < dt and guest.moves and given and flat and not here:
             bent = dot(n, plus(plus(there, -1.0, arm), -h, cross(guest.spin, arm)))
@@ -217,8 +222,10 @@ def turn_ahead(
         own, their = Arms(core, arm, arc, first_arc), Arms(seat, other, bow, first_bow)
         more = _swing((guest, own), (host, their), n, early, h, dt)
 
-        half = 0.5 * min(gap[c] if here else linear[c], 0.0)
+        half = 0.0 if one_place and not flat else 0.5 * min(gap[c] if here else linear[c], 0.0)
         arm, other = plus(arm, half, n), plus(other, -half, n)
+        if one_place:
+            other = plus(arm, 1.0, apart)
         if not here:
             gap[c], deep[found] = linear[c], c
             found += linear[c] < -DEEP * _thickness(guest.kind, size[a], inner)
@@ -347,7 +354,7 @@ def _swing(one, two, normal, early, h, dt):
     if dot(their.arc, their.arc) == 0.0 and dot(w, normal) != 0.0:  # the contact goes along a face that spins
         about = plus(_ZERO, dot(w, normal), normal)
         more = plus(more, 0.5 * dt if early else 0.5 * dt - h, cross(about, _slide(one, two, h, dt)))
-    if host.kind != SPHERE:
+    if host.kind != SPHERE or host.moves:
         more = plus(more, 1.0, cross(w, plus(plus(their.core, 1.0, their.first), -1.0, their.arm)))
     more = plus(more, -1.0, cross(u, plus(plus(own.core, 1.0, own.first), -1.0, own.arm)))
     if guest.kind >= CONVEX:

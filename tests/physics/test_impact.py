@@ -14,8 +14,10 @@ from drive import RADIUS, SOLVERS, make_steps, momentum
 from mpi4py import MPI
 
 import pctt
+from dem import quaternion
 from dem.contact.ahead import FURTHEST
 from dem.scene import Scene
+from dem.shapes import Clump, Cylinder, Superellipsoid
 from dem.start import new_world
 
 MASSES = [(1000.0, 1000.0), (500.0, 4000.0)]
@@ -121,3 +123,60 @@ def test_a_pair_that_a_spring_presses_together_keeps_its_angular_momentum(fricti
         before = angular_momentum(sim)
         sim.run(until=0.25)
         assert angular_momentum(sim) == pytest.approx(before, rel=5e-4)
+
+
+GRAINS = {
+    "ellipsoids": lambda scene, place, **moves: scene.add_grains(
+        place, Superellipsoid((0.15, 0.1, 0.08)), 1000.0, **moves
+    ),
+    "capsules": lambda scene, place, **moves: scene.add_capsules(place, 0.06, 0.08, 1000.0, **moves),
+    "cylinders": lambda scene, place, **moves: scene.add_grains(place, Cylinder(0.1, 0.15), 1000.0, **moves),
+    "boxes": lambda scene, place, **moves: scene.add_boxes(place, (0.1, 0.07, 0.12), 1000.0, **moves),
+    "clumps": lambda scene, place, **moves: scene.add_clumps(
+        place, Clump([(0, 0, 0), (0.12, 0, 0)], [0.08, 0.06]), 1000.0, **moves
+    ),
+}
+
+
+def whole_angular_momentum(sim):
+    """About the origin, of grains of any shapes."""
+    grains = sim.local
+    turned = quaternion.rotate(quaternion.conjugate(grains.quaternion), grains.velocity[:, 3:])
+    spin = quaternion.rotate(grains.quaternion, grains.inertia * turned)
+    return (np.cross(grains.position, grains.mass[:, None] * grains.velocity[:, :3]) + spin).sum(axis=0)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+@pytest.mark.parametrize("grains", GRAINS)
+def test_impacts_of_grains_that_are_no_spheres_keep_the_angular_momentum(grains, friction):
+    """Ways of a tenth of the size in a step: impulses on the places of the surfaces at the start, which are apart,
+    would add 1 to 6 %. What is left is of bodies that are struck while they tumble."""
+    rng, errors = np.random.default_rng(5), []
+    for restitution in (0.0, 0.7):
+        for _ in range(2):
+            scene = Scene(friction, gravity=(0, 0, 0), restitution=restitution)
+            for x in (-0.25, 0.25):
+                place, turn = [x, *rng.uniform(-0.05, 0.05, 2)], rng.normal(size=4)
+                spin = rng.normal(size=3)
+                GRAINS[grains](scene, place, quaternions=turn, velocity=(-4 * x, 0, 0), angular_velocity=spin)
+            with pctt.Simulation(scene, comm=MPI.COMM_SELF) as sim:
+                before, size = whole_angular_momentum(sim), 0.1 * sim.local.mass.sum()
+                sim.run(until=0.35)
+                assert np.abs(sim.velocities[:, 0]).max() < 0.95  # they have met
+                errors.append(np.linalg.norm(whole_angular_momentum(sim) - before) / size)
+    assert np.mean(errors) < 4e-3
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+@pytest.mark.parametrize("grains", ["ellipsoids", "capsules", "cylinders"])
+def test_round_grains_that_turn_on_each_other_keep_their_angular_momentum(grains, friction):
+    """A spring presses two together, which slide as they turn. With arms to two places they gained 1 to 6 %."""
+    scene = Scene(friction, gravity=(0, 0, 0))
+    moves = {"velocity": [[0, -0.5, 0], [0, 0.5, 0]], "angular_velocity": [[0, 0, 0], [0, 0, 3.0]]}
+    half = 0.15 if grains == "ellipsoids" else 0.06 if grains == "capsules" else 0.1
+    GRAINS[grains](scene, [[-half, 0, 0], [half, 0, 0]], **moves)
+    scene.add_spring("tie", 0, 1, stiffness=1e4, length=1.95 * half)
+    with pctt.Simulation(scene, comm=MPI.COMM_SELF) as sim:
+        before = whole_angular_momentum(sim)[2]
+        sim.run(until=0.25)
+        assert whole_angular_momentum(sim)[2] == pytest.approx(before, rel=1e-3)
