@@ -38,7 +38,7 @@ JOBS: dict[str, dict[str, Sequence[object]]] = {
     "silo": {
         f"silo_{outlet:g}_{seed}": (
             *("silo", "-scene_n", 6, "-scene_filling", 0.7, "-scene_half_angle", 90, "-scene_outlet", outlet),
-            *("-scene_seed", seed, "-dt", 0.005, "-seconds", seconds),
+            *("-scene_seed", seed, "-dt", 0.0025, "-seconds", seconds),
         )
         for outlet, seconds in zip(OUTLETS, (2.6, 1.75, 1.4))
         for seed in SEEDS

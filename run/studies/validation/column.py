@@ -25,7 +25,7 @@ class Column(Experiment):
     width: float = option(4.0, "radius of the cylinder", unit="sphere diameters")
     layers: int = option(28, "layers of the lattice")
     speed: float = option(0.005, "of the bottom, downwards", unit="m/s")
-    dt = 0.005
+    dt = 0.0025
     delta = 0.001
     settling_time = 0.6
 

@@ -27,7 +27,7 @@ class Heap(Experiment):
     layers: int = option(22, "above each other")
     seed: int = option(1, "seed of the places and of the radii")
     gate_speed: float = option(0.1, "of the gate, upwards", unit="m/s")
-    dt = 0.005
+    dt = 0.0025
     delta = 0.001
     settling_time = 0.6
 
