@@ -537,13 +537,13 @@ def test_much_friction_of_jointed_boxes_is_solved_by_interior_points():
     scene.add_joint("pin", None, boxes[0], kind="ball", anchor=(0.3, 0.1, 0.3))
     scene.add_joint("rod", boxes[3], boxes[6], kind="fixed", anchor=(0.3, 0.3, 0.3))
     sim = pctt.Simulation(scene, dt=0.01, comm=MPI.COMM_SELF, say=lambda text: None)
-    newton = 0
+    newton = iterations = 0
     for _ in range(40):
         figures = sim.step()
         assert figures["converged"], figures["reason"]
-        assert figures["iterations"] < 4000  # 27,000 by first-order methods alone
-        newton += figures["newton_its"]
+        newton, iterations = newton + figures["newton_its"], iterations + figures["iterations"]
     assert newton > 0
+    assert iterations < 20_000  # 4,000 to 6,000, of which one step may take half; first-order methods 27,000 in one
 
 
 def test_a_body_that_is_squeezed_against_its_joint_has_no_solution():
