@@ -163,9 +163,8 @@ class Stepper:
         something; collective. No result is kept for it: it takes memory while others are made."""
         # no impulses let bodies bounce as they are to, or only such as make energy: in a corner friction may press one
         # on a wall as fast as another sends it off
-        smooth = partial(replace, attempt, free=system.motion, smooth=True, before=result.cost)
         if not attempt.smooth and result.status is ccp.Status.UNBOUNDED and world.pairs.bounces:
-            return np.zeros((0, 6)), smooth
+            return np.zeros((0, 6)), _smooth(attempt, system, result)
         other = less = None
         with log.phase("search"):  # bodies that meet unforeseen
             system.set_rate(world, result.momentum)
@@ -177,7 +176,7 @@ class Stepper:
             if missed is other is None:  # impacts that would make energy
                 less = system.eased(world, result.impulse, result.momentum)
                 if less is None and system.jams and not attempt.smooth:
-                    return velocity, smooth
+                    return velocity, _smooth(attempt, system, result)
         if missed is other is less is None:
             return velocity, None
         more: dict[str, Any] = {
@@ -281,6 +280,11 @@ class Stepper:
             "peak_memory": _peak_memory(world.comm),
             "phases": log.take_seconds(phases),
         }
+
+
+def _smooth(attempt: _Attempt, system: ContactSystem, result: ccp.Result) -> Callable[[], _Attempt]:
+    """What makes the same attempt with impacts without friction."""
+    return partial(replace, attempt, free=system.motion, smooth=True, before=result.cost)
 
 
 def _wider(
